@@ -1,0 +1,1 @@
+"""One file a scan method: a spec becomes steps, an estimator and products."""

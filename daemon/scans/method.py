@@ -1,0 +1,103 @@
+"""The contract of a scan method: which steps, what each frame is for, which estimator.
+
+A method is asked for its next step until it gives None. It sees the summary of the estimator as
+far as frames have been taken in, so it may repeat, extend or end; it never touches a device.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, TypeVar
+
+from daemon.separation.estimator import Components, Estimator, Lighting, Observation
+from drivers.base import CameraInfo, ProjectorInfo, StageInfo
+from protocol.patterns import AnyPattern
+from protocol.scans import Scan
+
+S = TypeVar("S", bound=Scan)
+
+
+class Unsuitable(Exception):
+    """The rig cannot do the scan as it was asked for; says what and how to mend it."""
+
+    def __init__(self, message: str, where: str = "") -> None:
+        super().__init__(message)
+        self.where = where
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """The rig as a method sees it: facts, no devices. None: the rig has no such device."""
+
+    camera: CameraInfo
+    projector: ProjectorInfo | None = None
+    stage: StageInfo | None = None
+    lights: tuple[str, ...] = ()
+    calibration: Mapping[str, Any] | None = None  # of this rig's devices, by name
+
+
+@dataclass(frozen=True, slots=True)
+class Expose:
+    """A step: show one pattern, then expose `frames` times. On a recording, take the next frames.
+
+    With `pattern` None the projector goes dark and the lights off, as for ambient.
+    """
+
+    pattern: AnyPattern | None
+    lighting: Lighting = Lighting.PATTERN
+    index: int = 0  # which of the pattern set
+    frames: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """A step: let the camera stream, `frames` of them or (None) to the end of a recording."""
+
+    frames: int | None
+
+
+Step = Expose | Watch
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """What the recorder knows of a frame when the method decides on its use."""
+
+    step: int
+    sub: int
+    incomplete: bool
+    source: str = ""
+
+
+class Method(ABC, Generic[S]):
+    """A scan in its course. Made from a validated spec and a bench; pure."""
+
+    name: ClassVar[str]
+
+    def __init__(self, spec: S, bench: Bench) -> None:
+        """Raises Unsuitable when the rig lacks what the scan needs, or the numbers don't fit."""
+        self.spec = spec
+        self.bench = bench
+
+    @abstractmethod
+    def planned(self) -> int | None:
+        """Frames that the plan will expose; None where it is not known beforehand."""
+
+    @abstractmethod
+    def step(self, index: int, summary: Mapping[str, float]) -> Step | None:
+        """Step number `index`, or None at the end. For a plan the same index gives the same step,
+        which is how an interrupted scan goes on."""
+
+    @abstractmethod
+    def observe(self, step: Step, taken: Taken) -> Observation:
+        """Decide what a frame is used for. Called once a frame, in order; recorded."""
+
+    @abstractmethod
+    def estimator(self) -> Estimator:
+        """A fresh estimator for this scan."""
+
+    def conclude(self, components: Components) -> Components:
+        """The last word on the components before they are kept (masks that need the whole)."""
+        return components

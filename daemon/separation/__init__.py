@@ -1,0 +1,1 @@
+"""Pure estimators: frames in, components out. No I/O, no threads, no hardware."""

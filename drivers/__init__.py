@@ -1,0 +1,1 @@
+"""One file a device: each knows its hardware, and nothing of scans, networks or runs."""

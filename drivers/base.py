@@ -1,0 +1,420 @@
+"""What a device is: Camera, Projector, Stage, Light, the frames they make, the errors they raise.
+
+A driver is small: connect, identify, configure, act, halt, close. The daemon gives each device one
+thread that makes all of its calls, so a driver needs no locks of its own, with one exception:
+`halt()` may be called from any thread at any moment, also while another call is blocked, and makes
+that call return or raise soon. A driver never sleeps for a fixed time where it can wait for an
+event, and takes the time from its context's clock.
+
+Each driver's docstring states which of its commands are safe to send again after a failure.
+"""
+
+from __future__ import annotations
+
+import enum
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.clock import Clock, RealClock
+
+# ---------------------------------------------------------------- errors
+
+
+class DeviceError(Exception):
+    """Something went wrong in a device: which one, in what phase, and what to do about it."""
+
+    def __init__(self, device: str, phase: str, problem: str, remedy: str = "") -> None:
+        super().__init__(device, phase, problem, remedy)
+        self.device = device
+        self.phase = phase
+        self.problem = problem
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        sentence = f"{self.device}: {self.phase}: {self.problem}"
+        return f"{sentence}; {self.remedy}" if self.remedy else sentence
+
+
+class DeviceLost(DeviceError):
+    """It is not there, or no longer: nothing may be assumed of what was in flight."""
+
+
+class DeviceTimeout(DeviceError):
+    """It did not answer in time; it may or may not have acted."""
+
+
+class DeviceRefused(DeviceError):
+    """It answered no: it did not act, and the same command will be refused again."""
+
+
+class DeviceGarbled(DeviceError):
+    """It answered something that makes no sense."""
+
+
+class EndOfRecording(DeviceRefused):
+    """A recorded camera has no more frames."""
+
+
+# ---------------------------------------------------------------- what every device has
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A driver's own keys in rig.toml. Subclass it; the registry validates strictly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a device says it is; compared after every reconnect."""
+
+    model: str
+    serial: str = ""
+    firmware: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What drivers of one rig share: the clock, and a place to meet (the virtual bench)."""
+
+    clock: Clock = field(default_factory=RealClock)
+    shared: dict[str, Any] = field(default_factory=dict)
+
+
+class Device(ABC):
+    """The life of a device: made (touches nothing) -> connect -> ... -> close. `connect` may be
+    called again after a loss."""
+
+    Options: ClassVar[type[Options]] = Options
+    kind: ClassVar[str]
+
+    def __init__(self, name: str, options: Options, context: Context) -> None:
+        self.name = name
+        self.options = options
+        self.clock = context.clock
+
+    @abstractmethod
+    def connect(self) -> Identity:
+        """Open the device and find out what it is. Raises DeviceError; then nothing is held."""
+
+    @abstractmethod
+    def check(self) -> None:
+        """Ask for a sign of life, cheaply; called now and then while idle. Raises DeviceError."""
+
+    @abstractmethod
+    def safe(self) -> None:
+        """Go to the safe state (dark, off, held, stopped); idempotent. Raises DeviceError."""
+
+    @abstractmethod
+    def halt(self) -> None:
+        """From any thread: make a blocked call end, and stop what moves. Never blocks, never raises."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of everything; idempotent; does not raise for a device that is gone."""
+
+    def facts(self) -> dict[str, Any]:
+        """What people and scripts want to know of it, JSON-able; no I/O."""
+        return {}
+
+
+# ---------------------------------------------------------------- camera
+
+
+class PixelFormat(enum.StrEnum):
+    """SFNC PixelFormat names that Umbra understands. 10 and 12 bit are unpacked into uint16, unshifted."""
+
+    MONO8 = "Mono8"
+    MONO10 = "Mono10"
+    MONO12 = "Mono12"
+    MONO16 = "Mono16"
+    BAYER_RG8 = "BayerRG8"
+    BAYER_GR8 = "BayerGR8"
+    BAYER_GB8 = "BayerGB8"
+    BAYER_BG8 = "BayerBG8"
+    BAYER_RG10 = "BayerRG10"
+    BAYER_GR10 = "BayerGR10"
+    BAYER_GB10 = "BayerGB10"
+    BAYER_BG10 = "BayerBG10"
+    BAYER_RG12 = "BayerRG12"
+    BAYER_GR12 = "BayerGR12"
+    BAYER_GB12 = "BayerGB12"
+    BAYER_BG12 = "BayerBG12"
+    BAYER_RG16 = "BayerRG16"
+    BAYER_GR16 = "BayerGR16"
+    BAYER_GB16 = "BayerGB16"
+    BAYER_BG16 = "BayerBG16"
+    RGB8 = "RGB8"
+    RGB16 = "RGB16"
+
+    @property
+    def bits(self) -> int:
+        """Significant bits a sample."""
+        return int(self.value.lstrip("MonoBayerRGB"))
+
+    @property
+    def full_scale(self) -> int:
+        """The largest count."""
+        return (1 << self.bits) - 1
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """uint8 or uint16."""
+        return np.dtype(np.uint8 if self.bits == 8 else np.uint16)
+
+    @property
+    def bayer(self) -> str:
+        """The mosaic's first two pixels, "RG", "GR", "GB" or "BG"; "" where there is none."""
+        return self.value[5:7] if self.value.startswith("Bayer") else ""
+
+    @property
+    def channels(self) -> int:
+        """Samples a pixel: 3 for RGB, else 1."""
+        return 3 if self.value.startswith("RGB") else 1
+
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """What a configured camera delivers."""
+
+    width: int
+    height: int
+    pixel_format: PixelFormat
+    black_level: float = 0.0  # nominal counts in the dark
+    exposure_range_us: tuple[float, float] = (1.0, 1e9)
+    max_rate_hz: float = 0.0  # frames a second at the present exposure; 0: unknown
+    readout_s: float = 0.0  # from the end of the exposure to the frame being here
+    triggers: tuple[str, ...] = ("software",)  # software, hardware, none (free-running only)
+    recorded: bool = False  # frames were taken before: no projector is needed to get them
+    frame_count: int | None = None  # of a recording, if it is known
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of a frame's pixels: (H, W) or (H, W, 3)."""
+        plane = (self.height, self.width)
+        return plane if self.pixel_format.channels == 1 else (*plane, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """What a camera can be told; None leaves a setting as it is. SFNC: ExposureTime, Gain ..."""
+
+    exposure_us: float | None = None
+    gain: float | None = None
+    pixel_format: PixelFormat | None = None
+    frame_rate_hz: float | None = None
+    roi: tuple[int, int, int, int] | None = None  # x, y, width, height
+
+
+class Acquisition(enum.StrEnum):
+    """What makes a camera expose."""
+
+    SOFTWARE = "software"  # one frame a `trigger()`
+    HARDWARE = "hardware"  # one frame a pulse on its line
+    FREE = "free"  # one after the other at its own rate
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One exposure as the driver knows it; never modified after it leaves the driver.
+
+    `pixels` (H, W) or (H, W, 3) RGB, uint8 or uint16, C order. `start_ns`/`end_ns` bound the
+    exposure on the rig's monotonic clock. `sequence` is the device's own count: a gap is a loss.
+    `incomplete` says that parts are missing (lost packets): such a frame is never used.
+    """
+
+    pixels: NDArray[Any]
+    sequence: int
+    start_ns: int
+    end_ns: int
+    utc_ns: int
+    exposure_us: float
+    gain: float = 0.0
+    incomplete: bool = False
+    source: str = ""  # a recording's file name
+
+    @property
+    def mid_ns(self) -> int:
+        """The middle of the exposure."""
+        return (self.start_ns + self.end_ns) // 2
+
+
+class Camera(Device):
+    """A camera. Order of calls: connect, configure, start, (trigger, grab)*, stop, close."""
+
+    kind = "camera"
+
+    @abstractmethod
+    def info(self) -> CameraInfo:
+        """What it delivers as configured now; valid after connect; no I/O."""
+
+    @abstractmethod
+    def settings(self) -> CameraSettings:
+        """The settings in force, every field filled that the camera has; no I/O."""
+
+    @abstractmethod
+    def configure(self, wanted: CameraSettings) -> CameraSettings:
+        """Change settings, between `stop` and `start` only; gives those in force.
+
+        Raises DeviceRefused, naming the range, for a value that the camera cannot take.
+        """
+
+    @abstractmethod
+    def start(self, acquisition: Acquisition, at: int = 0) -> None:
+        """Begin to acquire; frames before it are forgotten. `at`: a recording's first frame."""
+
+    @abstractmethod
+    def trigger(self) -> tuple[int, int]:
+        """Begin one exposure (SOFTWARE); gives its start and its end on the clock, as far as known.
+
+        Returns at once, before the exposure ends. The caller may change the light after the end.
+        """
+
+    @abstractmethod
+    def grab(self, out: NDArray[Any], timeout_s: float) -> Frame:
+        """The next frame, its pixels in `out` (shape and dtype of `info()`).
+
+        Raises DeviceTimeout when none came (a lost trigger), EndOfRecording, DeviceLost.
+        """
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End acquisition; idempotent."""
+
+    def truth(self) -> dict[str, NDArray[np.float32]]:
+        """A simulated camera's noiseless `direct` and `global` (RGB or mono, linear counts, ambient
+        and black removed) under its present settings; {} for every camera of this world."""
+        return {}
+
+
+# ---------------------------------------------------------------- projector
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectorInfo:
+    """A projector as its patterns must be drawn."""
+
+    width: int
+    height: int
+    refresh_hz: float
+    latency_s: float = 0.0  # from the flip to light, where it is known
+
+
+class Projector(Device):
+    """A light source with pixels."""
+
+    kind = "projector"
+
+    @abstractmethod
+    def info(self) -> ProjectorInfo:
+        """Size and pace; valid after connect; no I/O."""
+
+    @abstractmethod
+    def show(self, image: NDArray[np.uint8]) -> int:
+        """Show `image` (H, W) uint8; returns when it has flipped: the moment on the clock from
+        which the light is this image's (latency included where the driver knows it)."""
+
+
+# ---------------------------------------------------------------- stage
+
+
+class StageState(enum.StrEnum):
+    """What a stage is doing.
+
+    unknown ──home──> homing ──> idle <──> moving | held;  any ──> alarm ──unlock──> unknown
+    any ──reconnect──> unknown
+    """
+
+    UNKNOWN = "unknown"  # its position is not known: nothing but homing is allowed
+    HOMING = "homing"
+    IDLE = "idle"
+    MOVING = "moving"
+    HELD = "held"
+    ALARM = "alarm"
+
+
+@dataclass(frozen=True, slots=True)
+class StageInfo:
+    """Travel in mm from the origin on each axis, and the fastest feed."""
+
+    travel_mm: tuple[tuple[float, float], tuple[float, float]]  # (x min, x max), (y min, y max)
+    max_feed_mm_s: float
+    max_acceleration_mm_s2: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class StageStatus:
+    """Where a stage was at a moment of the clock; `position_mm` is None while it is unknown."""
+
+    state: StageState
+    position_mm: tuple[float, float] | None
+    at_ns: int
+
+
+class Stage(Device):
+    """A motorised XY occluder. Motion calls return when the motion is accepted, not when it ends;
+    soft limits are checked before anything is sent (DeviceRefused)."""
+
+    kind = "stage"
+
+    @abstractmethod
+    def info(self) -> StageInfo:
+        """Limits; valid after connect; no I/O."""
+
+    @abstractmethod
+    def status(self) -> StageStatus:
+        """Ask it now. Raises DeviceTimeout, DeviceLost."""
+
+    @abstractmethod
+    def home(self, timeout_s: float) -> None:
+        """Find the origin; returns when it is found. Raises DeviceRefused naming the switch."""
+
+    @abstractmethod
+    def unlock(self) -> None:
+        """Leave the alarm without homing; the position stays unknown."""
+
+    @abstractmethod
+    def move(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
+        """Go straight to a point."""
+
+    @abstractmethod
+    def circle(
+        self, centre_mm: tuple[float, float], radius_mm: float, feed_mm_s: float, turns: float
+    ) -> None:
+        """Go round, without a stop between turns, from the circle's first point (angle 0)."""
+
+    @abstractmethod
+    def pump(self) -> StageStatus:
+        """Keep the planner full and the position fresh; called often while moving. See `status`."""
+
+    @abstractmethod
+    def position_at(self, at_ns: int) -> tuple[float, float] | None:
+        """Where it was at a moment of the clock, between the positions reported; None: unknown."""
+
+    @abstractmethod
+    def hold(self) -> None:
+        """Decelerate and hold; the position stays known. Idempotent."""
+
+    @abstractmethod
+    def resume(self) -> None:
+        """Go on after a hold."""
+
+
+# ---------------------------------------------------------------- light
+
+
+class Light(Device):
+    """A source that can only be switched."""
+
+    kind = "light"
+
+    @abstractmethod
+    def set(self, on: bool) -> None:
+        """Switch it; returns when it has switched. Safe to send again."""
+
+    @abstractmethod
+    def is_on(self) -> bool:
+        """What it was last told; no I/O."""

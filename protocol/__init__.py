@@ -1,0 +1,1 @@
+"""What travels between a client and `umbrad`, and who speaks it."""

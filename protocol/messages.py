@@ -1,0 +1,592 @@
+"""Commands, replies and events: everything that travels, as msgspec tagged structs.
+
+A request is a `Request` header (JSON) and one raw buffer for each entry of `arrays`; its answer
+is a `Response` of the same form with the same `id`. Events come on the second endpoint as
+``[topic, header, buffers...]``. `docs/protocol.md` is generated from this file.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from protocol.errors import ErrorInfo
+from protocol.patterns import AnyPattern
+from protocol.scans import AnyScan
+
+PROTOCOL = 1
+"""The one version of everything in this package; both sides must have the same."""
+
+DEFAULT_COMMAND = "tcp://127.0.0.1:5750"
+DEFAULT_EVENTS = "tcp://127.0.0.1:5751"
+
+
+class Role(enum.StrEnum):
+    """What a key may do."""
+
+    OBSERVER = "observer"  # read and subscribe
+    OPERATOR = "operator"  # everything
+
+
+# ---------------------------------------------------------------- states
+
+
+class RunState(enum.StrEnum):
+    """Where a run is in its life.
+
+        queued ──> running <──> paused
+           │          │ │          │
+           │          │ └────┬─────┘
+           │          v      v
+           │      finishing  aborted | failed | interrupted ──resume──> queued
+           │          v
+           │         done
+           └──> aborted
+
+    `interrupted` is what a restart makes of a run that was running, paused or finishing.
+    """
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    PAUSED = "paused"
+    FINISHING = "finishing"  # the last frame is in; products are being written
+    DONE = "done"
+    ABORTED = "aborted"
+    FAILED = "failed"
+    INTERRUPTED = "interrupted"
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more happens to the run by itself."""
+        return self in {self.DONE, self.ABORTED, self.FAILED, self.INTERRUPTED}
+
+
+class RigState(enum.StrEnum):
+    """What the rig as a whole is doing.
+
+    idle ──> manual ──> idle       a person shows patterns or takes snaps
+    idle | manual ──> scanning ──> idle
+    any ──> estopped ──reset──> idle
+    any ──> stopping               the daemon is shutting down
+    """
+
+    IDLE = "idle"
+    MANUAL = "manual"
+    SCANNING = "scanning"
+    ESTOPPED = "estopped"
+    STOPPING = "stopping"
+
+
+class Health(enum.StrEnum):
+    """How a device is."""
+
+    READY = "ready"
+    LOST = "lost"  # it was there; reconnection is being tried
+    FAULT = "fault"  # it answers, and says that something is wrong
+    STUCK = "stuck"  # a call into its driver has not come back in time
+
+
+# ---------------------------------------------------------------- facts
+
+
+class Fact(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A piece of a reply or an event."""
+
+
+class ArrayHeader(Fact, frozen=True, kw_only=True):
+    """One raw buffer that follows the header: C order, native little endian."""
+
+    name: str
+    dtype: str  # NumPy's: uint8, uint16, float32
+    shape: tuple[int, ...]
+
+
+class DeviceInfo(Fact, frozen=True, kw_only=True):
+    """One device of the rig. `facts` is what its driver says of it (size, refresh, format)."""
+
+    name: str  # "camera", "projector", "stage", or a light's name
+    kind: str  # camera, projector, stage, light
+    driver: str
+    health: Health
+    model: str = ""
+    serial: str = ""
+    firmware: str = ""
+    message: str = ""  # of the last fault
+    facts: dict[str, Any] = {}
+
+
+class Product(Fact, frozen=True, kw_only=True):
+    """A file that a run made."""
+
+    name: str  # direct, global, quality, preview, report ...
+    kind: str  # image, mask, facts, picture, report
+    file: str  # in the run's folder
+    unit: str = ""
+    bytes: int = 0
+
+
+class End(Fact, frozen=True, kw_only=True):
+    """Why a run ended; `by` names who aborted it."""
+
+    state: RunState
+    reason: str
+    code: str = ""
+    by: str = ""
+
+
+class RunInfo(Fact, frozen=True, kw_only=True):
+    """A run as it is now: an immutable snapshot. Times are UTC, ISO 8601."""
+
+    id: str
+    state: RunState
+    spec: AnyScan
+    submitted: str
+    by: str = ""
+    started: str = ""
+    ended: str = ""
+    planned: int | None = None  # frames, where the plan knows
+    recorded: int = 0
+    missing: int = 0
+    rejected: int = 0
+    end: End | None = None
+    products: tuple[Product, ...] = ()
+    parents: tuple[str, ...] = ()
+
+
+class Progress(Fact, frozen=True, kw_only=True):
+    """How far a run is. `fraction` is of the plan, or of the coverage wanted."""
+
+    run: str
+    state: RunState
+    recorded: int
+    planned: int | None
+    missing: int
+    rejected: int
+    fraction: float | None
+    rate_hz: float  # frames recorded a second, lately
+    remaining_s: float | None
+    phase: str = ""  # what is going on, for people
+    summary: dict[str, float] = {}  # the estimator's own figures
+
+
+class LockInfo(Fact, frozen=True, kw_only=True):
+    """Who holds the rig for manual work, and why."""
+
+    owner: str
+    note: str
+    remaining_s: float
+
+
+class CameraSettings(Fact, frozen=True, kw_only=True):
+    """What a camera can be told; ``None`` leaves a setting as it is. Names are SFNC's in lower case."""
+
+    exposure_us: Annotated[float, Meta(gt=0)] | None = None
+    gain: float | None = None
+    pixel_format: str | None = None
+    frame_rate_hz: Annotated[float, Meta(gt=0)] | None = None
+    roi: tuple[int, int, int, int] | None = None  # x, y, width, height
+
+
+# ---------------------------------------------------------------- commands
+
+
+class Command(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"
+):
+    """Something a client asks for. `role` is the least role that may."""
+
+    role: ClassVar[Role] = Role.OBSERVER
+
+
+class Hello(Command, frozen=True, kw_only=True, tag="hello"):
+    """First of all: who speaks, and which version."""
+
+    client: str = ""
+
+
+class GetStatus(Command, frozen=True, kw_only=True, tag="status"):
+    """A snapshot of everything that changes: rig, devices, current run, queue, event counters."""
+
+
+class GetDevices(Command, frozen=True, kw_only=True, tag="devices"):
+    """The devices in detail."""
+
+
+class Submit(Command, frozen=True, kw_only=True, tag="submit"):
+    """Queue a scan; answers at once with its run. Durable once answered."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    spec: AnyScan
+    by: str = ""
+    first: bool = False  # ahead of the queue
+
+
+class GetQueue(Command, frozen=True, kw_only=True, tag="queue"):
+    """The runs that wait, in order."""
+
+
+class MoveQueued(Command, frozen=True, kw_only=True, tag="move-queued"):
+    """Put a waiting run at another place in the queue (0 is next)."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    run: str
+    to: Annotated[int, Meta(ge=0)]
+
+
+class Pause(Command, frozen=True, kw_only=True, tag="pause"):
+    """Pause the run after the step under way; the projector goes dark, the stage holds."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    run: str = ""  # "": the current one
+
+
+class Resume(Command, frozen=True, kw_only=True, tag="resume"):
+    """Go on with a paused run, or queue an interrupted one again where it stopped."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    run: str = ""
+
+
+class Abort(Command, frozen=True, kw_only=True, tag="abort"):
+    """End a run, waiting or running, and go to the safe state; what was recorded is kept."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    run: str = ""
+    by: str = ""
+
+
+class EStop(Command, frozen=True, kw_only=True, tag="estop"):
+    """Safe state now: abort the run, hold the queue, refuse everything until `reset`."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    by: str = ""
+
+
+class Reset(Command, frozen=True, kw_only=True, tag="reset"):
+    """End an emergency stop: devices are checked, then the queue goes on."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+
+
+class ListRuns(Command, frozen=True, kw_only=True, tag="runs"):
+    """Runs, the newest first."""
+
+    limit: Annotated[int, Meta(ge=1, le=10_000)] = 50
+    state: RunState | None = None
+
+
+class GetRun(Command, frozen=True, kw_only=True, tag="run"):
+    """One run; "" is the current or else the newest."""
+
+    run: str = ""
+
+
+class GetResult(Command, frozen=True, kw_only=True, tag="result"):
+    """Direct and global as float32 arrays, at any time from the first frames on.
+
+    Arrays: `direct`, `global` (H x W or H x W x 3, RGB, linear counts), `quality` (uint16 bits).
+    """
+
+    run: str = ""
+
+
+class GetProduct(Command, frozen=True, kw_only=True, tag="product"):
+    """The bytes of a product's file, a part at a time. Array: `data` (uint8)."""
+
+    run: str
+    name: str
+    offset: Annotated[int, Meta(ge=0)] = 0
+    limit: Annotated[int, Meta(ge=1, le=64 << 20)] = 8 << 20
+
+
+class GetLog(Command, frozen=True, kw_only=True, tag="log"):
+    """The last log records of a run, or of the daemon."""
+
+    run: str = ""
+    limit: Annotated[int, Meta(ge=1, le=10_000)] = 200
+
+
+class GetPreview(Command, frozen=True, kw_only=True, tag="preview"):
+    """The latest frame, small: array `preview` (uint8, RGB), with counts of saturated pixels."""
+
+    width: Annotated[int, Meta(ge=16, le=4096)] = 640
+    what: str = "frame"  # frame, direct, global
+
+
+class Show(Command, frozen=True, kw_only=True, tag="show"):
+    """Show a pattern by hand; the projector goes dark when nobody has asked again for `lease_s`."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    pattern: AnyPattern
+    lease_s: Annotated[float, Meta(gt=0, le=86_400)] = 600.0
+
+
+class Snap(Command, frozen=True, kw_only=True, tag="snap"):
+    """Take one frame as things are. Array: `frame`, native depth; `png` (uint8) instead if asked."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    png: bool = False
+    demosaic: bool = True
+
+
+class SetCamera(Command, frozen=True, kw_only=True, tag="camera"):
+    """Change camera settings (none given: only read); answers with those in force."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    settings: CameraSettings = CameraSettings()
+
+
+class SetLight(Command, frozen=True, kw_only=True, tag="light"):
+    """Switch a light."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    name: str
+    on: bool
+
+
+class Dark(Command, frozen=True, kw_only=True, tag="dark"):
+    """End manual work: projector dark, lights off, stage held."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+
+
+class Lock(Command, frozen=True, kw_only=True, tag="lock"):
+    """Hold the rig for one client. It must be renewed before `lease_s` is over.
+
+    A lock that loses its heartbeat ends in the safe state. Others' motion, show, snap and scans
+    are refused with the owner's name meanwhile; abort and e-stop never are.
+    """
+
+    role: ClassVar[Role] = Role.OPERATOR
+    owner: str
+    note: str = ""
+    lease_s: Annotated[float, Meta(gt=0, le=3600)] = 10.0
+
+
+class RenewLock(Command, frozen=True, kw_only=True, tag="renew-lock"):
+    """The heartbeat of a lock; the request's `token` says which."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+
+
+class Unlock(Command, frozen=True, kw_only=True, tag="unlock"):
+    """Give the rig back. An operator may break another's lock with `force`."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    force: bool = False
+
+
+AnyCommand = (
+    Hello | GetStatus | GetDevices | Submit | GetQueue | MoveQueued | Pause | Resume | Abort
+    | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct | GetLog | GetPreview | Show
+    | Snap | SetCamera | SetLight | Dark | Lock | RenewLock | Unlock
+)  # fmt: skip
+
+
+# ---------------------------------------------------------------- replies
+
+
+class Reply(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):
+    """What a command is answered with."""
+
+
+class Welcome(Reply, frozen=True, kw_only=True, tag="welcome"):
+    """Answer to `hello`."""
+
+    protocol: int
+    server: str  # the daemon's version
+    rig: str
+    epoch: str  # new at each start of the daemon: event counters begin again
+    role: Role
+    events: str  # where events are published; host * or 0.0.0.0 means: the one you reached
+    methods: tuple[str, ...]
+    devices: tuple[str, ...]
+
+
+class Status(Reply, frozen=True, kw_only=True, tag="status"):
+    """Answer to `status`: the snapshot that events modify."""
+
+    rig: str
+    state: RigState
+    epoch: str
+    uptime_s: float
+    devices: tuple[DeviceInfo, ...]
+    run: RunInfo | None
+    progress: Progress | None
+    queue: tuple[RunInfo, ...]
+    lock: LockInfo | None
+    free_bytes: int
+    reserve_bytes: int
+    sequences: dict[str, int]  # topic -> sequence number of its last event
+
+
+class Devices(Reply, frozen=True, kw_only=True, tag="devices"):
+    """Answer to `devices`."""
+
+    devices: tuple[DeviceInfo, ...]
+
+
+class Run(Reply, frozen=True, kw_only=True, tag="run"):
+    """Answer to all that is about one run."""
+
+    run: RunInfo
+
+
+class Runs(Reply, frozen=True, kw_only=True, tag="runs"):
+    """Answer to `runs` and `queue`."""
+
+    runs: tuple[RunInfo, ...]
+
+
+class Result(Reply, frozen=True, kw_only=True, tag="result"):
+    """Answer to `result`; final when the run is done. `facts` is quality.json's content so far."""
+
+    run: RunInfo
+    final: bool
+    facts: dict[str, Any] = {}
+
+
+class ProductPart(Reply, frozen=True, kw_only=True, tag="product"):
+    """Answer to `product`: `offset + len(data) == size` at the end."""
+
+    product: Product
+    offset: int
+    size: int
+
+
+class Log(Reply, frozen=True, kw_only=True, tag="log"):
+    """Answer to `log`: JSON objects, oldest first."""
+
+    records: tuple[dict[str, Any], ...]
+
+
+class Picture(Reply, frozen=True, kw_only=True, tag="picture"):
+    """Answer to `preview` and `snap`. `facts`: exposure, saturated fraction, histogram, times."""
+
+    facts: dict[str, Any] = {}
+
+
+class Camera(Reply, frozen=True, kw_only=True, tag="camera"):
+    """Answer to `camera`: the settings in force."""
+
+    settings: CameraSettings
+
+
+class Locked(Reply, frozen=True, kw_only=True, tag="locked"):
+    """Answer to `lock`: send the token with every request."""
+
+    token: str
+    lease_s: float
+
+
+class Done(Reply, frozen=True, kw_only=True, tag="done"):
+    """Answer where there is nothing more to say."""
+
+    message: str = ""
+
+
+AnyReply = (
+    Welcome | Status | Devices | Run | Runs | Result | ProductPart | Log | Picture | Camera
+    | Locked | Done
+)  # fmt: skip
+
+
+# ---------------------------------------------------------------- events
+
+
+class EventBody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):
+    """What happened."""
+
+    topic: ClassVar[str]
+
+
+class RunChanged(EventBody, frozen=True, kw_only=True, tag="run-changed"):
+    """A run has another state, or products."""
+
+    topic: ClassVar[str] = "run"
+    run: RunInfo
+
+
+class Progressed(EventBody, frozen=True, kw_only=True, tag="progressed"):
+    """The current run went on; at most some ten times a second."""
+
+    topic: ClassVar[str] = "progress"
+    progress: Progress
+
+
+class QueueChanged(EventBody, frozen=True, kw_only=True, tag="queue-changed"):
+    """Other runs wait, or in another order."""
+
+    topic: ClassVar[str] = "queue"
+    queue: tuple[str, ...]
+
+
+class DeviceChanged(EventBody, frozen=True, kw_only=True, tag="device-changed"):
+    """A device's health changed."""
+
+    topic: ClassVar[str] = "device"
+    device: DeviceInfo
+
+
+class RigChanged(EventBody, frozen=True, kw_only=True, tag="rig-changed"):
+    """The rig as a whole changed its state, or its lock its owner."""
+
+    topic: ClassVar[str] = "rig"
+    state: RigState
+    lock: LockInfo | None = None
+    reason: str = ""
+
+
+class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
+    """A small picture of the latest frame or separation. Array: `preview` (uint8, RGB)."""
+
+    topic: ClassVar[str] = "preview"
+    run: str
+    what: str
+    facts: dict[str, Any] = {}
+
+
+AnyEvent = RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | PreviewTaken
+
+
+# ---------------------------------------------------------------- envelopes
+
+
+class Preamble(Struct, frozen=True, kw_only=True):
+    """The part of a request that every version can read: checked before the rest."""
+
+    id: str = ""
+    protocol: int = 0
+
+
+class Request(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A request's header. The client makes `id`, at random: a repeat gets the first answer."""
+
+    id: Annotated[str, Meta(min_length=8, max_length=64)]
+    protocol: int
+    command: AnyCommand
+    token: str = ""  # of the lock, if the client holds it
+    arrays: tuple[ArrayHeader, ...] = ()
+
+
+class Response(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A response's header: a reply or an error, never both."""
+
+    id: str
+    reply: AnyReply | None = None
+    error: ErrorInfo | None = None
+    arrays: tuple[ArrayHeader, ...] = ()
+
+
+class Event(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An event's header. `sequence` counts within the topic and epoch, without gaps."""
+
+    topic: str
+    sequence: int
+    epoch: str
+    utc: str
+    body: AnyEvent
+    arrays: tuple[ArrayHeader, ...] = ()

@@ -1,0 +1,88 @@
+"""What a client may ask for: one frozen struct a method, pure validated data.
+
+A spec says nothing of devices or time; the daemon's method of the same name turns it into
+steps. Symbols are the paper's: α lit fraction, b leakage of an unlit source element.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Count = Annotated[int, Meta(ge=1, le=100_000)]
+Leak = Annotated[float, Meta(ge=0.0, lt=1.0)]
+LitFraction = Annotated[float, Meta(gt=0.0, le=1.0)]
+Positive = Annotated[float, Meta(gt=0.0)]
+ToneCurve = Annotated[
+    str,
+    Meta(
+        pattern=r"^(linear|srgb|gamma:[0-9]+(\.[0-9]+)?)$",
+        description="linear, srgb, or gamma:2.2 (the exponent that the camera encoded with)",
+    ),
+]
+
+
+class Reference(enum.StrEnum):
+    """A frame that is not part of the pattern set."""
+
+    AMBIENT = "ambient"  # the source off: nothing of the source, all of the room
+    BLACK = "black"  # the source showing black: ambient and leakage
+    WHITE = "white"  # the source showing white: everything
+
+
+class Radiometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How camera counts become linear light. ``None`` means: as the rig is calibrated."""
+
+    black: Annotated[float, Meta(ge=0.0)] | None = None  # counts with no light at all
+    tone: ToneCurve = "linear"  # undone before anything is computed
+    leakage: Leak | None = None  # b
+    saturation: Positive | None = None  # counts from which a sample is called saturated
+
+
+class Scan(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="method"
+):
+    """What every scan can be told, whatever its method."""
+
+    note: str = ""
+    exposure_us: Positive | None = None  # None: as the camera is set
+    gain: float | None = None
+    radiometry: Radiometry = Radiometry()
+    #: frames taken before the patterns; None: black and white where the source can show them
+    references: tuple[Reference, ...] | None = None
+
+
+class PatternScan(Scan, frozen=True, kw_only=True):
+    """A scan of a fixed set of patterns."""
+
+    average: Count = 1  # frames averaged a pattern (the paper: 32)
+    lit_fraction: LitFraction | None = None  # α; None: the pattern's own
+    estimator: Literal["maxmin"] = "maxmin"
+
+
+class Checkerboard(PatternScan, frozen=True, kw_only=True, tag="checkerboard"):
+    """Checkerboard shifts (§4.1): the paper's 25 images are 8 px checkers, 5 x 5 shifts of 3 px."""
+
+    checker: Annotated[int, Meta(ge=1, le=1024)] = 8
+    shift: Annotated[int, Meta(ge=1, le=1024)] = 3
+    shifts: Annotated[int, Meta(ge=2, le=64)] = 5  # in each direction
+
+
+class TwoImage(PatternScan, frozen=True, kw_only=True, tag="two-image"):
+    """A checkerboard and its complement (§3.3, Eq. 8)."""
+
+    checker: Annotated[int, Meta(ge=1, le=1024)] = 8
+
+
+class Stick(Scan, frozen=True, kw_only=True, tag="stick"):
+    """A thin occluder swept over the scene on video (§4.2): α is close to 1, b = 0 in the umbra."""
+
+    lit_fraction: LitFraction = 1.0
+    frames: Count | None = None  # None: to the end of the recording
+    estimator: Literal["maxmin"] = "maxmin"
+
+
+AnyScan = Checkerboard | TwoImage | Stick
