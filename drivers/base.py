@@ -110,7 +110,7 @@ class Device(ABC):
 
     @abstractmethod
     def halt(self) -> None:
-        """From any thread: make a blocked call end, and stop what moves. Never blocks, never raises."""
+        """From any thread: end a blocked call, stop what moves. Never blocks, never raises."""
 
     @abstractmethod
     def close(self) -> None:
@@ -125,7 +125,7 @@ class Device(ABC):
 
 
 class PixelFormat(enum.StrEnum):
-    """SFNC PixelFormat names that Umbra understands. 10 and 12 bit are unpacked into uint16, unshifted."""
+    """SFNC PixelFormat names that Umbra understands; 10 and 12 bit come unpacked and unshifted."""
 
     MONO8 = "Mono8"
     MONO10 = "Mono10"
@@ -153,7 +153,7 @@ class PixelFormat(enum.StrEnum):
     @property
     def bits(self) -> int:
         """Significant bits a sample."""
-        return int(self.value.lstrip("MonoBayerRGB"))
+        return int("".join(c for c in self.value if c.isdigit()))
 
     @property
     def full_scale(self) -> int:

@@ -53,7 +53,7 @@ class RealClock(Clock):
 
 
 class ScaledClock(Clock):
-    """A clock that runs `speed` times as fast as the machine's: an hour of a virtual rig in minutes."""
+    """A clock `speed` times as fast as the machine's: an hour of a virtual rig in minutes."""
 
     def __init__(self, speed: float) -> None:
         if not speed > 0:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import enum
 from typing import Annotated, Any, ClassVar
 
-import msgspec
 from msgspec import Meta, Struct
 
 from protocol.errors import ErrorInfo
@@ -181,7 +180,7 @@ class LockInfo(Fact, frozen=True, kw_only=True):
 
 
 class CameraSettings(Fact, frozen=True, kw_only=True):
-    """What a camera can be told; ``None`` leaves a setting as it is. Names are SFNC's in lower case."""
+    """What a camera can be told; None leaves a setting as it is. Names: SFNC's, in snake case."""
 
     exposure_us: Annotated[float, Meta(gt=0)] | None = None
     gain: float | None = None
@@ -193,9 +192,7 @@ class CameraSettings(Fact, frozen=True, kw_only=True):
 # ---------------------------------------------------------------- commands
 
 
-class Command(
-    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"
-):
+class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):
     """Something a client asks for. `role` is the least role that may."""
 
     role: ClassVar[Role] = Role.OBSERVER
@@ -325,7 +322,7 @@ class Show(Command, frozen=True, kw_only=True, tag="show"):
 
 
 class Snap(Command, frozen=True, kw_only=True, tag="snap"):
-    """Take one frame as things are. Array: `frame`, native depth; `png` (uint8) instead if asked."""
+    """Take one frame as things are. Array: `frame`, native depth, or `png` (uint8) if asked."""
 
     role: ClassVar[Role] = Role.OPERATOR
     png: bool = False

@@ -1,8 +1,8 @@
 """Multipart framing: a JSON header, then one raw buffer an array. Nothing is copied through text.
 
-    client -> daemon   [header, buffer...]            (DEALER; ROUTER sees the identity before it)
-    daemon -> client   [header, buffer...]
-    events             [topic, header, buffer...]
+client -> daemon   [header, buffer...]            (DEALER; ROUTER sees the identity before it)
+daemon -> client   [header, buffer...]
+events             [topic, header, buffer...]
 """
 
 from __future__ import annotations
