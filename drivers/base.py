@@ -88,7 +88,7 @@ class Device(ABC):
     """The life of a device: made (touches nothing) -> connect -> ... -> close. `connect` may be
     called again after a loss."""
 
-    Options: ClassVar[type[Options]] = Options
+    options_type: ClassVar[type[Options]] = Options
     kind: ClassVar[str]
 
     def __init__(self, name: str, options: Options, context: Context) -> None:

@@ -51,4 +51,4 @@ def build(kind: str, driver: str, name: str, options: dict[str, Any], context: C
     Raises UnknownDriver, or msgspec.ValidationError with the path of the offending key.
     """
     cls = load(kind, driver)
-    return cls(name, msgspec.convert(options, cls.Options), context)
+    return cls(name, msgspec.convert(options, cls.options_type), context)

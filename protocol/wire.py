@@ -40,7 +40,7 @@ def encode(header: msgspec.Struct, arrays: Arrays | None = None) -> list[bytes |
     for name, a in (arrays or {}).items():
         if a.dtype.name not in _ALLOWED:
             raise ValueError(f"array {name}: the protocol does not carry {a.dtype}")
-        parts.append(memoryview(np.ascontiguousarray(a)).cast("B"))
+        parts.append(np.ascontiguousarray(a).reshape(-1).view(np.uint8).data)
     return parts
 
 

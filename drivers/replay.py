@@ -1,0 +1,1 @@
+"""A camera over a folder of images or a video file."""
