@@ -6,10 +6,12 @@ from typing import Any
 
 from daemon.scans.checkerboard import CheckerboardMethod
 from daemon.scans.method import Bench, Method, Unsuitable
-from protocol.scans import AnyScan, Checkerboard
+from daemon.scans.two_image import TwoImageMethod
+from protocol.scans import AnyScan, Checkerboard, TwoImage
 
 _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     Checkerboard: CheckerboardMethod,
+    TwoImage: TwoImageMethod,
 }
 
 NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())

@@ -111,12 +111,16 @@ class PatternMethod(Method[P]):
     @property
     def lit_fraction(self) -> float:
         """α: as asked for, else the pattern set's own on this projector."""
+        return self.lit_fraction_of(self._patterns)
+
+    def lit_fraction_of(self, shown: Sequence[AnyPattern]) -> float:
+        """α of some patterns: as asked for, else their mean on this projector, else a half."""
         if self.spec.lit_fraction is not None:
             return self.spec.lit_fraction
         projector = self.bench.projector
         if projector is None:
             return 0.5
-        lit = [patterns.lit_fraction(p, projector.width, projector.height) for p in self._patterns]
+        lit = [patterns.lit_fraction(p, projector.width, projector.height) for p in shown]
         return sum(lit) / len(lit)
 
     def planned(self) -> int:

@@ -112,8 +112,7 @@ class MaxMin:
                 "unused_frames": self._unused,
                 "lit_fraction": self._alpha,
                 "leakage": self._leakage,
-                "ambient_from": source,
-                **{f"{k}_frames": self._references.frames(k) for k in Lighting if k != "pattern"},
+                **self._references.facts(source),
             },
         )
 

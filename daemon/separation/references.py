@@ -35,15 +35,10 @@ class References:
         mean = self._means.get(lighting)
         return mean.value() if mean else None
 
-    def frames(self, lighting: Lighting) -> int:
-        """How many frames of a kind came."""
-        mean = self._means.get(lighting)
-        return mean.frames if mean else 0
-
-    @property
-    def white_saturated(self) -> NDArray[np.bool_] | None:
-        """Samples that were saturated in a white frame."""
-        return self._white_saturated
+    def facts(self, ambient_from: str) -> dict[str, Any]:
+        """Which reference frames there were and what ambient light was taken from."""
+        frames = {kind.value: mean.frames for kind, mean in self._means.items()}
+        return {"ambient_from": ambient_from, "reference_frames": frames}
 
     def ambient(
         self, brightest: Plane, darkest: Plane, lit_fraction: float, leakage: float
