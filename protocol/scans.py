@@ -14,9 +14,9 @@ from msgspec import Meta
 
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 Leak = Annotated[float, Meta(ge=0.0, lt=1.0)]
-LitFraction = Annotated[float, Meta(gt=0.0, le=1.0, description="α, lit fraction of the source")]
+LitFraction = Annotated[float, Meta(gt=0.0, le=1.0, description="lit fraction α of the source")]
 Positive = Annotated[float, Meta(gt=0.0)]
-Checker = Annotated[int, Meta(ge=1, le=1024, description="side of a checker, projector pixels")]
+Checker = Annotated[int, Meta(ge=1, le=1024, description="side of a checker in projector pixels")]
 ToneCurve = Annotated[
     str,
     Meta(
@@ -25,7 +25,7 @@ ToneCurve = Annotated[
     ),
 ]
 
-LEAKAGE = "b, brightness of an unlit source element as a fraction of a lit one"
+LEAKAGE = "brightness b of an unlit source element as a fraction of a lit one"
 ESTIMATOR = "how frames become components; maxmin is the paper's"
 
 
@@ -55,14 +55,14 @@ class Scan(
     """What every scan can be told, whatever its method."""
 
     note: Annotated[str, Meta(description="what the run is for, kept with it")] = ""
-    exposure_us: Annotated[Positive, Meta(description="exposure of a frame, µs")] | None = None
+    exposure_us: Annotated[Positive, Meta(description="exposure of a frame in µs")] | None = None
     gain: Annotated[float, Meta(description="of the camera, in its own unit")] | None = None
     radiometry: Radiometry = Radiometry()
     #: None: black and white where the source can show them
     references: (
         Annotated[
             tuple[Reference, ...],
-            Meta(description="frames taken before the patterns, of ambient, black, white"),
+            Meta(description="frames to take before the patterns"),
         ]
         | None
     ) = None
@@ -80,7 +80,7 @@ class Checkerboard(PatternScan, frozen=True, kw_only=True, tag="checkerboard"):
     """Checkerboard shifts (§4.1): the paper's 25 images are 8 px checkers, 5 x 5 shifts of 3 px."""
 
     checker: Checker = 8
-    shift: Annotated[int, Meta(ge=1, le=1024, description="projector pixels from one to next")] = 3
+    shift: Annotated[int, Meta(ge=1, le=1024, description="step from one to the next, px")] = 3
     shifts: Annotated[int, Meta(ge=2, le=64, description="shifts in each direction")] = 5
 
 
