@@ -302,7 +302,7 @@ class FakeRig:
 
 
 def _bound(socket: zmq.Socket[bytes]) -> str:
-    return bytes(socket.getsockopt(zmq.LAST_ENDPOINT)).decode().rstrip("\0")  # type: ignore[arg-type]
+    return bytes(socket.getsockopt(zmq.LAST_ENDPOINT)).decode().rstrip("\0")
 
 
 class _Allowed:
