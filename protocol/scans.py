@@ -21,7 +21,7 @@ ToneCurve = Annotated[
     str,
     Meta(
         pattern=r"^(linear|srgb|gamma:[0-9]+(\.[0-9]+)?)$",
-        description="linear, srgb, or gamma:2.2 (the exponent that the camera encoded with)",
+        description="tone curve: linear, srgb, or gamma:2.2 (the exponent it was encoded with)",
     ),
 ]
 

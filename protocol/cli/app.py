@@ -18,7 +18,7 @@ from protocol.errors import UmbraError
 SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "Without a rig": {
         "demo": ("demo:demo", "Separate a simulated scene: a first look, no hardware needed."),
-        "separate": ("separate:app", "Separate photographs or a video that you already have."),
+        "separate": ("separate:separate", "Separate photographs or a video that you already have."),
     },
     "Scans": {
         "scan": ("scan:app", "Queue a scan: checkerboard, two-image, stick ..."),

@@ -10,15 +10,35 @@ from collections.abc import Callable
 from typing import Any, ClassVar, get_args
 
 import msgspec
+import typer
 from typer.core import TyperGroup
 
 from protocol.cli.app import command_of
 from protocol.cli.options import build, options_of, with_options
+from protocol.errors import Code, UmbraError
 
 
 def members(union: Any) -> dict[str, type[msgspec.Struct]]:
     """The structs of a tagged union by tag, in its order."""
     return {str(struct.__struct_config__.tag): struct for struct in get_args(union)}
+
+
+def member(union: Any, tag: str, option: str) -> type[msgspec.Struct]:
+    """The struct of this tag. Raises UmbraError(bad_request) that names the option and the tags."""
+    known = members(union)
+    if tag not in known:
+        raise UmbraError(
+            Code.BAD_REQUEST, f"{option}: {tag!r} is not one of {', '.join(known)}", option
+        )
+    return known[tag]
+
+
+def tag_option(union: Any, *names: str, help_text: str) -> Any:
+    """An option that takes a tag of the union, by `member`."""
+    known = [*members(union)]
+    return typer.Option(
+        *names, metavar="|".join(known), help=help_text, autocompletion=lambda: known
+    )
 
 
 def about(struct: type[msgspec.Struct]) -> str:

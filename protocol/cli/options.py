@@ -79,7 +79,7 @@ class Option:
         facts = [self.help] if self.help else []
         if self.choices and (self.item is not None or len(self.choices) > 4):
             facts.append("one of " + ", ".join(self.choices))
-        if self.default not in (None, ""):
+        if self.default not in (None, "", False):
             facts.append(f"default {self.default}")
         text = "; ".join(facts)
         return text[:1].upper() + text[1:]
@@ -227,17 +227,23 @@ def sentence(message: str, options: Sequence[Option]) -> str:
     return f"{flag}: {what}" if flag else what
 
 
+SHARED = {"force", "rig", "keys", "as_json"}
+"""Parameters of many commands: they come last in the help."""
+
+
 def with_options(
     function: Callable[..., Any], parameters: Iterable[inspect.Parameter]
 ) -> Callable[..., Any]:
     """The function with its `**given` replaced by these parameters, for typer to read."""
     signature = inspect.signature(function, eval_str=True)
     kept = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    own = [p for p in kept if p.name not in SHARED]
+    shared = [p for p in kept if p.name in SHARED]
 
     def command(**values: Any) -> Any:
         return function(**values)
 
-    everything = [p.replace(kind=p.KEYWORD_ONLY) for p in [*parameters, *kept]]
+    everything = [p.replace(kind=p.KEYWORD_ONLY) for p in [*own, *parameters, *shared]]
     command.__name__, command.__doc__ = function.__name__, function.__doc__
     command.__annotations__ = {p.name: p.annotation for p in everything}
     command.__dict__["__signature__"] = inspect.Signature(everything)
