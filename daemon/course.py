@@ -56,6 +56,7 @@ class Course:
     def __init__(
         self,
         folder: RunFolder,
+        *,
         rig: Rig,
         store: Store,
         config: RigConfig,
@@ -134,7 +135,7 @@ class Course:
             end = self.control.verdict or End(
                 state=RunState.INTERRUPTED, reason="the devices were taken away"
             )
-        except Exception as error:  # noqa: BLE001 - a run may fail, the daemon may not
+        except Exception as error:
             if isinstance(error, DeviceError):
                 self._rig.failed(error)
             known = as_error(error)
@@ -180,7 +181,7 @@ class Course:
             self._timings["prepare_s"] = time.monotonic() - began
             scanning = self._rig.clock.now_ns()
             try:
-                self._sequence(session, method, recorder, ring, step, sub)
+                self._sequence(session, method, recorder, ring, (step, sub))
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.
                 recorder.finish()
@@ -188,7 +189,7 @@ class Course:
             self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
             truth = self._rig.camera.call(lambda c: c.truth(), CALL_S, session)
             self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
-            return self._conclude(method, recorder, info, truth)
+            return self._conclude(recorder, info, truth)
         finally:
             frames.close()
 
@@ -198,8 +199,7 @@ class Course:
         method: Method[Any],
         recorder: Recorder,
         ring: Ring,
-        step: int,
-        sub: int,
+        start: tuple[int, int],
     ) -> None:
         try:
             Sequencer(
@@ -212,7 +212,7 @@ class Course:
                 patience=self._config.sequencer,
                 may_go_on=self._may_go_on,
                 on_pause=self._paused,
-            ).run(step, sub, recorder.tally.taken)
+            ).run(*start, taken=recorder.tally.taken)
         except Behind as error:
             raise UmbraError(
                 Code.STORAGE_FAILED,
@@ -323,15 +323,11 @@ class Course:
         self._on_change()
 
     def _count(self, tally: Tally) -> None:
-        self.folder.update(
-            recorded=tally.recorded, missing=tally.missing, rejected=tally.rejected
-        )
+        self.folder.update(recorded=tally.recorded, missing=tally.missing, rejected=tally.rejected)
 
     # ------------------------------------------------------------ after
 
-    def _conclude(
-        self, method: Method[Any], recorder: Recorder, info: CameraInfo, truth: Mapping[str, Any]
-    ) -> End:
+    def _conclude(self, recorder: Recorder, info: CameraInfo, truth: Mapping[str, Any]) -> End:
         self._update(state=RunState.FINISHING)
         self._say("writing products")
         began = time.monotonic()

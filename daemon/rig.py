@@ -288,7 +288,9 @@ class Rig:
                 future.result(max(0.0, deadline - time.monotonic()))
             except (DeviceError, Revoked, TimeoutError) as error:
                 safe = False
-                log.error("device not in its safe state", error=str(error) or "no answer in time")
+                log.error(  # noqa: TRY400 - the device's sentence says it all
+                    "device not in its safe state", error=str(error) or "no answer in time"
+                )
                 if isinstance(error, DeviceError):
                     self.failed(error)
         return safe
