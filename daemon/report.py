@@ -10,6 +10,7 @@ from html import escape
 from importlib import resources
 from string import Template
 from typing import Any
+from urllib.parse import quote
 
 import cv2
 import msgspec
@@ -17,7 +18,7 @@ import numpy as np
 
 from daemon.display import Picture
 from daemon.frames import FrameRecord
-from daemon.quality import BITS
+from daemon.quality import BITS, Bit
 from daemon.store import RunFile
 from protocol.messages import Product
 
@@ -25,10 +26,10 @@ _ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a line of ad
 _DIM_BELOW = 0.25  # of full scale: a scene that uses less than this is under-exposed
 _MOST_BARS = 240
 _TITLES = {
-    "frame": "A frame, as the camera saw it",
-    "direct": "Direct: light that came straight from the source",
-    "global": "Global: light that came by way of the scene",
-    "quality": "Quality: flagged pixels in colour",
+    "frame": "as the camera saw the scene",
+    "direct": "light that came straight from the source",
+    "global": "light that came by way of the scene",
+    "quality": "flagged pixels in colour",
 }
 
 
@@ -84,10 +85,10 @@ def advice(subject: Subject) -> list[str]:
             "resume the run, or scan again."
         )
     if file.missing:
-        lines.append(f"{_count(file.missing, 'frame')} missing: see below why, then scan again.")
+        lines.append(f"{_frames(file.missing)} missing: see below why, then scan again.")
     if file.rejected:
-        lines.append(f"{_count(file.rejected, 'frame')} recorded but not used: see below why.")
-    for bit in sorted(BITS, key=lambda b: -_share(facts, b.name)):
+        lines.append(f"{_frames(file.rejected)} recorded but not used: see below why.")
+    for bit in _seen(facts):
         share = _share(facts, bit.name)
         if share >= _ADVISED_FROM:
             lines.append(f"{_percent(share)} of the pixels: {_lower(bit.meaning)} {bit.remedy}")
@@ -138,7 +139,7 @@ def _figures(subject: Subject) -> str:
     if truth:
         for name in ("direct", "global"):
             error = _percent(truth[f"rmse_{name}"])
-            found.append((f"{name}: error to the truth, RMS of full scale", error, ""))
+            found.append((f"of full scale: RMS error of {name}", error, ""))
     return "".join(
         f'<div class="{kind}"><b>{escape(value)}</b><span>{escape(name)}</span></div>'
         for name, value, kind in found
@@ -146,29 +147,46 @@ def _figures(subject: Subject) -> str:
 
 
 def _viewer(subject: Subject) -> str:
-    height, width = subject.pictures["direct"].shape[:2]
-    figures = "".join(
-        f'<figure class="{name}"><img src="{_data_uri(name, picture)}" alt="{escape(title)}">'
-        f"<figcaption>{escape(title)}</figcaption></figure>"
-        for name, title in _TITLES.items()
-        if (picture := subject.pictures.get(name)) is not None
+    shown = [name for name in _TITLES if name in subject.pictures]
+    views = {"compare": "Direct | global"} | {name: name.capitalize() for name in shown}
+    inputs = "".join(
+        f'<input type="radio" name="v" id="v-{name}"{" checked" if name == "compare" else ""}>'
+        for name in views
     )
-    return f'<div class="screen" style="aspect-ratio:{width}/{height}">{figures}</div>'
+    tabs = "".join(f'<label for="v-{name}">{title}</label>' for name, title in views.items())
+    figures = "".join(
+        f'<figure class="{name}">'
+        f'<img src="{_data_uri(name, subject.pictures[name])}" alt="{name}: {_TITLES[name]}">'
+        f"<figcaption><b>{name.capitalize()}</b><span>{_TITLES[name]}</span>"
+        f"{_key(subject.facts) if name == 'quality' else ''}</figcaption></figure>"
+        for name in shown
+    )
+    height, width = subject.pictures["direct"].shape[:2]
+    return (
+        f'<div class="viewer">{inputs}<div class="tabs">{tabs}</div>'
+        f'<div class="screen" style="aspect-ratio:{width}/{height}">{figures}</div></div>'
+    )
+
+
+def _key(facts: Mapping[str, Any]) -> str:
+    """The colours in the overlay, the most frequent first."""
+    return "".join(
+        f'<span class="key"><i style="background:{bit.hex}"></i>{_name(bit)}</span>'
+        for bit in _seen(facts)
+    )
 
 
 def _legend(facts: Mapping[str, Any]) -> str:
-    seen = [b for b in reversed(BITS) if _share(facts, b.name) > 0]
-    rows = []
-    for bit in sorted(seen, key=lambda b: -_share(facts, b.name)):
-        share = _share(facts, bit.name)
-        rows.append(
-            f'<li><i style="background:{bit.hex}"></i><div><b>{bit.name.replace("_", " ")}</b>'
-            f"<em>{_percent(share)}</em><p>{escape(bit.meaning)}</p>"
-            f'<p class="do">{escape(bit.remedy)}</p></div></li>'
-        )
-    absent = [b.name.replace("_", " ") for b in BITS if b not in seen]
-    none = f'<p class="quiet">On no pixel: {", ".join(absent)}.</p>' if absent else ""
-    return f'<ul class="legend">{"".join(rows)}</ul>{none}'
+    seen = _seen(facts)
+    rows = "".join(
+        f'<li><i style="background:{bit.hex}"></i><div><b>{_name(bit)}</b>'
+        f"<em>{_percent(_share(facts, bit.name))}</em><p>{escape(bit.meaning)}</p>"
+        f'<p class="do">{escape(bit.remedy)}</p></div></li>'
+        for bit in seen
+    )
+    absent = ", ".join(_name(bit) for bit in BITS if bit not in seen)
+    legend = f'<ul class="legend">{rows}</ul>' if rows else "<p>No pixel is flagged.</p>"
+    return legend + (f'<p class="quiet">On no pixel: {absent}.</p>' if absent else "")
 
 
 def _histogram(subject: Subject) -> str:
@@ -180,8 +198,8 @@ def _histogram(subject: Subject) -> str:
     heights = 120 * counts / counts.max()
     step = 640 / len(heights)
     bars = "".join(
-        f'<rect x="{i * step + 0.5:.1f}" y="{120 - h:.1f}" width="{step - 1:.1f}" '
-        f'height="{h:.1f}"{" class=hot" if i == len(heights) - 1 else ""}/>'
+        f'<rect class="{"hot" if i == len(heights) - 1 else "bar"}" x="{i * step + 0.5:.1f}" '
+        f'y="{120 - h:.1f}" width="{step - 1:.1f}" height="{h:.1f}"/>'
         for i, h in enumerate(heights)
         if h > 0
     )
@@ -266,22 +284,22 @@ def _missing(records: Sequence[FrameRecord]) -> str:
     reasons: dict[tuple[str, str], list[int]] = {}
     for r in records:
         if r.missing:
-            reasons.setdefault(("missing", r.missing), []).append(r.index)
+            reasons.setdefault(("Missing", r.missing), []).append(r.index)
         elif not r.observation.used:
-            reasons.setdefault(("not used", r.observation.reason), []).append(r.index)
+            reasons.setdefault(("Not used", r.observation.reason), []).append(r.index)
     if not reasons:
         return ""
     rows = "".join(
-        f"<tr><th>{kind}</th><td>{escape(why or 'no reason given')}</td>"
-        f"<td>{len(where)}: {escape(_ranges(where))}</td></tr>"
+        f"<li><b>{kind}: {escape(why or 'no reason given')}</b><em>{_frames(len(where))}</em>"
+        f'<p class="do">{escape(_ranges(where))}</p></li>'
         for (kind, why), where in reasons.items()
     )
-    return f"<section><h2>Missing and rejected frames</h2><table>{rows}</table></section>"
+    return f'<section><h2>Missing and rejected</h2><ul class="missing">{rows}</ul></section>'
 
 
 def _files(products: Sequence[Product]) -> str:
     return "".join(
-        f'<li><a href="{escape(p.file)}">{escape(p.file)}</a>'
+        f'<li><a href="./{quote(p.file)}">{escape(p.file)}</a>'
         f"<span>{_size(p.bytes)}{f' · {escape(p.unit)}' if p.unit else ''}</span></li>"
         for p in products
     )
@@ -327,6 +345,16 @@ def _share(facts: Mapping[str, Any], name: str) -> float:
     return float(found.get("fraction", 0.0))
 
 
+def _seen(facts: Mapping[str, Any]) -> list[Bit]:
+    """Bits on any pixel, the most frequent first."""
+    seen = [bit for bit in BITS if _share(facts, bit.name) > 0]
+    return sorted(seen, key=lambda bit: -_share(facts, bit.name))
+
+
+def _name(bit: Bit) -> str:
+    return bit.name.replace("_", " ")
+
+
 def _percent(share: float | None) -> str:
     if share is None or not math.isfinite(share):
         return "unknown"
@@ -344,8 +372,8 @@ def _size(count: int) -> str:
     return f"{size:.3g} GB"
 
 
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun} was" if number == 1 else f"{number} {noun}s were"
+def _frames(number: int) -> str:
+    return "1 frame" if number == 1 else f"{number} frames"
 
 
 def _lower(sentence: str) -> str:
