@@ -35,7 +35,7 @@ class Demonstrated(Fetched, frozen=True, kw_only=True):
 def demo(
     *,
     method: Annotated[
-        str, tag_option(AnyScan, "-m", "--method", help_text="The scan; default checkerboard.")
+        str, tag_option(AnyScan, "-m", "--method", help_text="The scan.")
     ] = "checkerboard",
     out: Annotated[
         Path | None,
