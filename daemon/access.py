@@ -113,7 +113,7 @@ class _Provider:
         try:
             entry = self._allowed.current().get(key.decode("ascii"))
         except UmbraError as error:
-            log.error("the list of keys cannot be read", error=error.message)
+            log.warning("the list of keys cannot be read", error=error.message)
             return False
         if entry is None:
             log.warning(

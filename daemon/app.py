@@ -11,11 +11,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import os
 import secrets
 import signal
 import sys
-import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -72,10 +72,14 @@ def main(arguments: list[str] | None = None) -> int:
     except config.ConfigError as error:
         print(f"umbrad: {error}", file=sys.stderr)
         return 2
-    except UmbraError as error:
-        print(f"umbrad: {error.message}", file=sys.stderr)
+    except (UmbraError, StartError) as error:
+        print(f"umbrad: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+class StartError(Exception):
+    """umbrad cannot start; the message is one line."""
 
 
 class _Daemon:
@@ -150,7 +154,7 @@ class _Daemon:
                 self._serve(self._watch(interval, rig, runner))
             if until_eof:
                 self._until_eof(loop)
-            self._notifier.ready(self._status(commands, runner))
+            self._notifier.ready(self._status_line(runner))
             log.info(
                 "ready",
                 rig=self._config.rig.name,
@@ -191,9 +195,8 @@ class _Daemon:
         try:
             socket.bind(endpoint)
         except zmq.ZMQError as error:
-            raise UmbraError(
-                "unreachable",  # type: ignore[arg-type]
-                f"{endpoint}: {error.strerror or error}; is another umbrad running?",
+            raise StartError(
+                f"{endpoint}: {error.strerror or error}; is another umbrad running?"
             ) from error
         return socket
 
@@ -244,7 +247,7 @@ class _Daemon:
 
     def _until_eof(self, loop: asyncio.AbstractEventLoop) -> None:
         def readable() -> None:
-            if not sys.stdin.buffer.read1(4096):
+            if not os.read(sys.stdin.fileno(), 4096):
                 loop.remove_reader(sys.stdin)
                 self._ask_to_stop("standard input was closed")
 

@@ -151,9 +151,7 @@ class Commands:
     async def _submit(self, command: m.Submit, asked: _Asked) -> Answer:
         self._manual.admit(asked.token)
         if self._estopped:
-            raise UmbraError(
-                Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it"
-            )
+            raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
         by = command.by or asked.caller.name
         # Writing run.json takes an fsync: not in the loop.
         run = await asyncio.to_thread(
@@ -262,13 +260,17 @@ class Commands:
                     raise UmbraError(
                         Code.NO_RESULT, "no frame has been taken yet; `umbra snap` takes one"
                     )
-                small = picture.resized(glimpse.picture, command.width)
-                return Answer(m.Picture(facts={**glimpse.facts, "run": glimpse.run}), {"preview": small})
+                small = picture.narrowed(glimpse.picture, command.width)
+                return Answer(
+                    m.Picture(facts={**glimpse.facts, "run": glimpse.run}), {"preview": small}
+                )
             run = self._runner.find("")
             components, _ = self._components(run)
             plane = components.direct if command.what == "direct" else components.global_
             shown = picture.component(plane, command.width)
-            return Answer(m.Picture(facts={"run": run.id, "what": command.what}), {"preview": shown})
+            return Answer(
+                m.Picture(facts={"run": run.id, "what": command.what}), {"preview": shown}
+            )
 
         return await asyncio.to_thread(look)
 
@@ -288,7 +290,9 @@ class Commands:
 
     async def _show(self, command: m.Show, asked: _Asked) -> Answer:
         await self._by_hand(asked, lambda: self._manual.show(command.pattern, command.lease_s))
-        return Answer(m.Done(message=f"shown; dark in {command.lease_s:g} s, or with `umbra show off`"))
+        return Answer(
+            m.Done(message=f"shown; dark in {command.lease_s:g} s, or with `umbra show off`")
+        )
 
     async def _snap(self, command: m.Snap, asked: _Asked) -> Answer:
         def snap() -> Answer:

@@ -41,6 +41,8 @@ _PROGRESS_S = 0.1
 _ROOM_S = 1.0
 _RATE_FRAMES = 20
 _RESULT_S = 30.0
+_STILL_S = 60.0
+"""A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
 
 log = structlog.get_logger(__name__)
 
@@ -79,6 +81,7 @@ class Course:
         self._told = 0.0
         self._room_seen = 0.0
         self._timings: dict[str, float] = {}
+        self._exposure_s = 0.0
         self.beat = time.monotonic()
 
     # ------------------------------------------------------------ for others
@@ -115,6 +118,12 @@ class Course:
             return recorder.result(_RESULT_S)
         except NotYet as error:
             raise UmbraError(Code.NO_RESULT, str(error)) from error
+
+    @property
+    def alive(self) -> bool:
+        """Whether it has moved lately; a pause, and the making of products, count as moving."""
+        at_rest = self.control.paused or self.folder.file.state is not RunState.RUNNING
+        return at_rest or time.monotonic() - self.beat < _STILL_S + 2 * self._exposure_s
 
     def _rate(self) -> float:
         moments = list(self._moments)
@@ -231,6 +240,7 @@ class Course:
             wanted = CameraSettings(exposure_us=known["exposure_us"], gain=known["gain"])
         camera = self._rig.camera
         in_force = camera.call(lambda c: c.configure(wanted), CALL_S, session)
+        self._exposure_s = (in_force.exposure_us or 0.0) * 1e-6
         return {"exposure_us": in_force.exposure_us, "gain": in_force.gain}
 
     def _same_devices(self, before: Mapping[str, Any]) -> None:

@@ -143,7 +143,17 @@ class Runner:
         self._held.discard(why)
         self._wake.set()
 
+    def end_for_estop(self, by: str) -> None:
+        """The devices have been stopped: the current run ends as aborted."""
+        if self._course is not None:
+            self._course.control.end(RunState.ABORTED, "emergency stop", by=by)
+
     # ------------------------------------------------------------ what is going on
+
+    @property
+    def alive(self) -> bool:
+        """Whether the run under way, if any, has moved lately (the watchdog's question)."""
+        return self._course is None or self._course.alive
 
     @property
     def current(self) -> RunFolder | None:

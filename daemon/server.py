@@ -69,7 +69,7 @@ class Server:
         self,
         socket: zmq.asyncio.Socket,
         handle: Handler,
-        caller_of: Callable[[zmq.Frame], Caller],
+        caller_of: Callable[[zmq.Frame], Caller | None],
     ) -> None:
         self._socket = socket
         self._handle = handle
@@ -93,6 +93,8 @@ class Server:
         if len(parts) < 2:
             return  # not even a header: nobody to answer
         caller = self._caller_of(parts[1])
+        if caller is None:
+            return  # a key that was revoked: strangers get no reply
         frames = await self._answer(bytes(parts[1].buffer), len(parts) - 2, caller)
         try:
             await self._socket.send_multipart([parts[0].bytes, *frames], copy=False)
@@ -159,7 +161,7 @@ class Server:
                 id=request.id, reply=answer.reply, arrays=wire.headers(answer.arrays)
             )
             return wire.encode(response, answer.arrays)
-        except Exception as error:  # noqa: BLE001 - a command may fail, the daemon may not
+        except Exception as error:
             known = as_error(error)
             if known.code is Code.INTERNAL:
                 log.exception("command failed", command=type(request.command).__name__)

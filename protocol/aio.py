@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
+import weakref
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
@@ -18,8 +19,9 @@ from typing import TypeVar
 import zmq
 import zmq.asyncio
 
+from protocol.arrivals import arrival, place_for, place_in
 from protocol.client import chosen_keys, own_name
-from protocol.commands import Commands, Following, Separation
+from protocol.commands import Commands
 from protocol.connection import (
     ATTEMPTS,
     Ask,
@@ -35,9 +37,11 @@ from protocol.connection import (
     unreachable,
 )
 from protocol.errors import Code, UmbraError
+from protocol.following import SILENCE_S, Following
 from protocol.keys import ClientKeys
 from protocol.messages import Progress, RunInfo, RunState, Welcome
-from protocol.run import SILENCE_S, described, failure, part_file, target
+from protocol.results import Separation
+from protocol.run import described, failure
 from protocol.scans import AnyScan
 
 T = TypeVar("T")
@@ -62,7 +66,8 @@ class AsyncClient(Commands):
         self.timeout_s = timeout_s
         self.name = name or own_name()
         self.token = ""  # of the lock, while this client holds it
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._context = zmq.asyncio.Context()
+        self._streams: weakref.WeakSet[AsyncEventStream] = weakref.WeakSet()
         self._lines: list[_Line] = []
         self._waiting: dict[str, asyncio.Future[list[zmq.Frame]]] = {}
 
@@ -82,9 +87,9 @@ class AsyncClient(Commands):
         for future in self._waiting.values():
             if not future.done():
                 future.set_exception(_closed())
-        for line in self._lines:
-            await line.close()
-        self._lines.clear()
+        await self._retire(keep=0)
+        for stream in list(self._streams):
+            stream.close()
         self._context.destroy(linger=0)
 
     async def __aenter__(self) -> AsyncClient:
@@ -119,9 +124,16 @@ class AsyncClient(Commands):
             future.cancel()
             del self._waiting[exchange.id]
             if not self._waiting:
-                for line in self._lines[:-1]:
-                    await line.close()
-                del self._lines[:-1]
+                await self._retire(keep=1)
+
+    async def _retire(self, *, keep: int) -> None:
+        """Close all lines but the newest."""
+        old, self._lines = (
+            self._lines[: len(self._lines) - keep],
+            self._lines[len(self._lines) - keep :],
+        )
+        for line in old:
+            await line.close()
 
     def _line(self, *, fresh: bool) -> _Line:
         if self._context.closed:
@@ -144,8 +156,8 @@ class AsyncClient(Commands):
     async def download(self, run: str, name: str, to: Path | str) -> Path:
         """Fetch a product's file to a path, or into a folder; the file appears when it is whole."""
         part = await self.product_part(run, name)
-        path = target(to, part.product)
-        with part_file(path) as file:
+        path = place_for(to, part.product)
+        with arrival(path) as file:
             while True:
                 await asyncio.to_thread(file.write, part.data)
                 done = part.offset + len(part.data)
@@ -163,12 +175,14 @@ class AsyncClient(Commands):
         No topic means all but previews. Close it, or use it as a context manager.
         """
         endpoint = events_endpoint(self.welcome, self.endpoint)
-        return AsyncEventStream(
+        stream = AsyncEventStream(
             [
                 subscriber(self._context, endpoint, self.keys, names, hwm)
                 for names, hwm in split_topics(topics)
             ]
         )
+        self._streams.add(stream)
+        return stream
 
     # -------------------------------------------------------- the lock
 
@@ -219,11 +233,10 @@ class _Line:
 
     def __init__(
         self,
-        socket: zmq.Socket[bytes],
+        socket: zmq.asyncio.Socket,
         waiting: dict[str, asyncio.Future[list[zmq.Frame]]],
     ) -> None:
-        self._socket = zmq.asyncio.Socket(shadow=socket)
-        self._owned = socket
+        self._socket = socket
         self._waiting = waiting
         self._reader = asyncio.create_task(self._read())
 
@@ -242,52 +255,52 @@ class _Line:
         self._reader.cancel()
         await asyncio.wait([self._reader])
         self._socket.close()
-        self._owned.close()
 
 
 class AsyncEventStream:
     """Events, one after the other; made by `AsyncClient.subscribe`."""
 
-    def __init__(self, sockets: list[zmq.Socket[bytes]]) -> None:
-        self._owned = sockets
-        self._sockets = [zmq.asyncio.Socket(shadow=s) for s in sockets]
+    def __init__(self, sockets: list[zmq.asyncio.Socket]) -> None:
+        self._sockets = sockets
         self._inbox = Inbox()
         self._waiting: deque[Notice] = deque()
 
     async def next(self, timeout_s: float | None = None) -> Notice | None:
-        """The next event, or None after `timeout_s` without one."""
+        """The next event, or None after `timeout_s` without one and when the stream is closed."""
         until = None if timeout_s is None else time.monotonic() + timeout_s
         poller = zmq.asyncio.Poller()
         for socket in self._sockets:
             poller.register(socket, zmq.POLLIN)
         while not self._waiting:
+            if any(socket.closed for socket in self._sockets):
+                return None
             left = None if until is None else until - time.monotonic()
             if left is not None and left <= 0:
                 return None
             await poller.poll(None if left is None else max(1, int(left * 1000)))
-            self._waiting.extend(self._inbox.take(self._drained()))
+            self._waiting.extend(self._inbox.take(await self._drained()))
         return self._waiting.popleft()
 
-    def _drained(self) -> list[list[zmq.Frame]]:
+    async def _drained(self) -> list[list[zmq.Frame]]:
         messages = []
-        for socket in self._owned:
+        for socket in self._sockets:
             with contextlib.suppress(zmq.Again):
                 while True:
-                    messages.append(socket.recv_multipart(zmq.NOBLOCK, copy=False))
+                    messages.append(await socket.recv_multipart(zmq.NOBLOCK, copy=False))
         return messages
 
     def __aiter__(self) -> AsyncEventStream:
         return self
 
     async def __anext__(self) -> Notice:
-        notice = None if all(s.closed for s in self._owned) else await self.next()
+        notice = await self.next()
         if notice is None:
             raise StopAsyncIteration
         return notice
 
     def close(self) -> None:
         """Unsubscribe."""
-        for socket in [*self._sockets, *self._owned]:
+        for socket in self._sockets:
             socket.close()
 
     async def __aenter__(self) -> AsyncEventStream:
@@ -330,7 +343,7 @@ class AsyncRun:
                 if following.ended:
                     break
                 notice = await events.next(SILENCE_S)
-                if notice is None or following.needs_snapshot(notice.event.epoch, notice.gap):
+                if notice is None or following.outdated_by(notice.event):
                     news = await self._snapshot(following)
                 else:
                     news = following.event(notice.event)
@@ -360,9 +373,10 @@ class AsyncRun:
 
     async def save(self, folder: Path | str) -> list[Path]:
         """Fetch all products into a folder, which is made; the files written."""
-        await asyncio.to_thread(Path(folder).mkdir, parents=True, exist_ok=True)
-        info = await self.refresh()
-        return [await self._rig.download(self.id, p.name, folder) for p in info.products]
+        return [
+            await self._rig.download(self.id, product.name, place_in(folder, product))
+            for product in (await self.refresh()).products
+        ]
 
     async def pause(self) -> None:
         """Pause after the step under way."""

@@ -20,6 +20,7 @@ from typing import TypeVar
 
 import zmq
 
+from protocol.arrivals import arrival, place_for
 from protocol.commands import Commands
 from protocol.connection import (
     ATTEMPTS,
@@ -39,7 +40,7 @@ from protocol.connection import (
 from protocol.errors import Code, UmbraError
 from protocol.keys import ClientKeys
 from protocol.messages import Welcome
-from protocol.run import Run, part_file, target
+from protocol.run import Run
 from protocol.scans import AnyScan
 
 T = TypeVar("T")
@@ -178,8 +179,8 @@ class Client(Commands):
     def download(self, run: str, name: str, to: Path | str) -> Path:
         """Fetch a product's file to a path, or into a folder; the file appears when it is whole."""
         part = self.product_part(run, name)
-        path = target(to, part.product)
-        with part_file(path) as file:
+        path = place_for(to, part.product)
+        with arrival(path) as file:
             while True:
                 file.write(part.data)
                 done = part.offset + len(part.data)
@@ -238,7 +239,9 @@ class EventStream(Iterator[Notice]):
         self._waiting: deque[Notice] = deque()
 
     def next(self, timeout_s: float | None = None) -> Notice | None:
-        """The next event, or None after `timeout_s` without one."""
+        """The next event, or None after `timeout_s` without one and when the stream is closed."""
+        if any(socket.closed for socket in self._sockets):
+            return None
         until = None if timeout_s is None else time.monotonic() + timeout_s
         poller = zmq.Poller()
         for socket in self._sockets:
@@ -263,14 +266,10 @@ class EventStream(Iterator[Notice]):
         return self
 
     def __next__(self) -> Notice:
-        notice = None if self._closed else self.next()
+        notice = self.next()
         if notice is None:
             raise StopIteration
         return notice
-
-    @property
-    def _closed(self) -> bool:
-        return all(socket.closed for socket in self._sockets)
 
     def close(self) -> None:
         """Unsubscribe."""

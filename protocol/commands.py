@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
 from typing import (
     TYPE_CHECKING,
     Any,
@@ -23,15 +22,23 @@ from typing import (
 )
 
 from protocol import messages as m
-from protocol.connection import Answer, Ask, checked, expect
-from protocol.messages import CameraSettings, Progress, Role, RunInfo, RunState
+from protocol.connection import Ask, checked, expect
+from protocol.messages import CameraSettings, RunInfo, RunState
 from protocol.patterns import AnyPattern
+from protocol.results import (
+    Part,
+    Picture,
+    Separation,
+    message_of,
+    part_of,
+    picture_of,
+    run_of,
+    runs_of,
+    separation_of,
+)
 from protocol.scans import AnyScan
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from protocol.aio import AsyncClient
     from protocol.client import Client
 
@@ -75,101 +82,6 @@ def _bound(make: Callable[..., Any]) -> inspect.Signature:
     return whole.replace(parameters=list(whole.parameters.values())[1:], return_annotation=back)
 
 
-# ---------------------------------------------------------------- what comes back
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A frame or a preview: the array, or the bytes of a PNG file, and what is known of it."""
-
-    pixels: NDArray[Any]
-    facts: dict[str, Any]
-
-    def _repr_html_(self) -> str:
-        shown = ", ".join(f"{k} {v}" for k, v in self.facts.items() if isinstance(v, int | float))
-        return f"<code>{'×'.join(map(str, self.pixels.shape))} {self.pixels.dtype}</code> {shown}"
-
-
-@dataclass(frozen=True)
-class Separation:
-    """Direct and global light: float32, H x W or H x W x 3 (RGB), linear camera counts.
-
-    The arrays are read-only views of the message that was received; copy one to change it.
-    `quality` is a mask of named bits (uint16), or None. `final` is False while the run goes on.
-    Python has taken the name `global`: `global_` it is here, or ``getattr(result, "global")``.
-    """
-
-    direct: NDArray[np.float32]
-    global_: NDArray[np.float32]
-    quality: NDArray[np.uint16] | None
-    run: RunInfo
-    facts: dict[str, Any]
-    final: bool
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "global":
-            return self.global_
-        raise AttributeError(name)
-
-    def __repr__(self) -> str:
-        size = "×".join(map(str, self.direct.shape))
-        kind = "final" if self.final else f"so far ({self.run.recorded} frames)"
-        return f"<Separation of {self.run.id}: direct, global_ {size} float32, {kind}>"
-
-
-def _separation(answer: Answer) -> Separation:
-    reply = expect(answer.reply, m.Result)
-    return Separation(
-        direct=answer.array("direct", "float32"),
-        global_=answer.array("global", "float32"),
-        quality=answer.array("quality", "uint16") if "quality" in answer.arrays else None,
-        run=reply.run,
-        facts=reply.facts,
-        final=reply.final,
-    )
-
-
-def _picture(*names: str) -> Callable[[Answer], Picture]:
-    def made(answer: Answer) -> Picture:
-        reply = expect(answer.reply, m.Picture)
-        name = next((n for n in names if n in answer.arrays), names[0])
-        return Picture(answer.array(name), reply.facts)
-
-    return made
-
-
-def _run(answer: Answer) -> RunInfo:
-    return expect(answer.reply, m.Run).run
-
-
-def _runs(answer: Answer) -> tuple[RunInfo, ...]:
-    return expect(answer.reply, m.Runs).runs
-
-
-def _message(answer: Answer) -> str:
-    """What the daemon says to a command that has no other answer."""
-    return expect(answer.reply, m.Done).message
-
-
-def _whatever(answer: Answer) -> m.AnyReply:
-    return answer.reply
-
-
-@dataclass(frozen=True)
-class Part:
-    """A part of a product's file."""
-
-    product: m.Product
-    offset: int
-    size: int
-    data: memoryview
-
-
-def _part(answer: Answer) -> Part:
-    reply = expect(answer.reply, m.ProductPart)
-    return Part(reply.product, reply.offset, reply.size, answer.array("data", "uint8").data)
-
-
 # ---------------------------------------------------------------- the commands
 
 
@@ -199,62 +111,62 @@ class Commands:
     @command
     def submit(self, spec: AnyScan, *, first: bool = False) -> Ask[RunInfo]:
         """Queue a scan, ahead of the others if `first`; comes back at once. `scan` gives a Run."""
-        return Ask(m.Submit(spec=spec, by=self.name, first=first), _run)
+        return Ask(m.Submit(spec=spec, by=self.name, first=first), run_of)
 
     @command
     def queue(self) -> Ask[tuple[RunInfo, ...]]:
         """The runs that wait, in order."""
-        return Ask(m.GetQueue(), _runs)
+        return Ask(m.GetQueue(), runs_of)
 
     @command
-    def move_queued(self, run: str, to: int) -> Ask[m.AnyReply]:
+    def move_queued(self, run: str, to: int) -> Ask[tuple[RunInfo, ...]]:
         """Put a waiting run at another place in the queue (0 is next)."""
-        return Ask(m.MoveQueued(run=run, to=to), _whatever)
+        return Ask(m.MoveQueued(run=run, to=to), runs_of)
 
     @command
-    def pause(self, run: str = "") -> Ask[m.AnyReply]:
+    def pause(self, run: str = "") -> Ask[RunInfo]:
         """Pause a run after the step under way: projector dark, stage held."""
-        return Ask(m.Pause(run=run), _whatever)
+        return Ask(m.Pause(run=run), run_of)
 
     @command
-    def resume(self, run: str = "") -> Ask[m.AnyReply]:
+    def resume(self, run: str = "") -> Ask[RunInfo]:
         """Go on with a paused run, or queue an interrupted one where it stopped."""
-        return Ask(m.Resume(run=run), _whatever)
+        return Ask(m.Resume(run=run), run_of)
 
     @command
-    def abort(self, run: str = "") -> Ask[m.AnyReply]:
+    def abort(self, run: str = "") -> Ask[RunInfo]:
         """End a run and go to the safe state; what was recorded is kept."""
-        return Ask(m.Abort(run=run, by=self.name), _whatever)
+        return Ask(m.Abort(run=run, by=self.name), run_of)
 
     @command
-    def estop(self) -> Ask[m.AnyReply]:
+    def estop(self) -> Ask[str]:
         """Safe state now; everything is refused until `reset`."""
-        return Ask(m.EStop(by=self.name), _whatever)
+        return Ask(m.EStop(by=self.name), message_of)
 
     @command
-    def reset(self) -> Ask[m.AnyReply]:
+    def reset(self) -> Ask[str]:
         """End an emergency stop."""
-        return Ask(m.Reset(), _whatever)
+        return Ask(m.Reset(), message_of)
 
     @command
     def runs(self, limit: int = 50, state: RunState | None = None) -> Ask[tuple[RunInfo, ...]]:
         """Runs, the newest first."""
-        return Ask(m.ListRuns(limit=limit, state=state), _runs)
+        return Ask(m.ListRuns(limit=limit, state=state), runs_of)
 
     @command
     def run_info(self, run: str = "") -> Ask[RunInfo]:
         """What is known of one run; `run` gives a handle on it."""
-        return Ask(m.GetRun(run=run), _run)
+        return Ask(m.GetRun(run=run), run_of)
 
     @command
     def result(self, run: str = "") -> Ask[Separation]:
         """Direct and global, final or so far."""
-        return Ask(m.GetResult(run=run), _separation, SLOW_S)
+        return Ask(m.GetResult(run=run), separation_of, SLOW_S)
 
     @command
     def product_part(self, run: str, name: str, offset: int = 0, limit: int = 8 << 20) -> Ask[Part]:
         """A part of a product's file; `download` fetches a whole one."""
-        return Ask(m.GetProduct(run=run, name=name, offset=offset, limit=limit), _part, SLOW_S)
+        return Ask(m.GetProduct(run=run, name=name, offset=offset, limit=limit), part_of, SLOW_S)
 
     @command
     def log(self, run: str = "", limit: int = 200) -> Ask[tuple[dict[str, Any], ...]]:
@@ -266,17 +178,17 @@ class Commands:
         self, width: int = 640, what: Literal["frame", "direct", "global"] = "frame"
     ) -> Ask[Picture]:
         """The latest frame, small (uint8, RGB)."""
-        return Ask(m.GetPreview(width=width, what=what), _picture("preview"))
+        return Ask(m.GetPreview(width=width, what=what), picture_of("preview"))
 
     @command
-    def show(self, pattern: AnyPattern, lease_s: float = 600.0) -> Ask[m.AnyReply]:
+    def show(self, pattern: AnyPattern, lease_s: float = 600.0) -> Ask[str]:
         """Show a pattern by hand; the projector goes dark after `lease_s`."""
-        return Ask(m.Show(pattern=pattern, lease_s=lease_s), _whatever)
+        return Ask(m.Show(pattern=pattern, lease_s=lease_s), message_of)
 
     @command
     def snap(self, *, png: bool = False, demosaic: bool = True) -> Ask[Picture]:
         """Take one frame as things are: native depth, or the bytes of a PNG file."""
-        return Ask(m.Snap(png=png, demosaic=demosaic), _picture("frame", "png"), SLOW_S)
+        return Ask(m.Snap(png=png, demosaic=demosaic), picture_of("frame", "png"), SLOW_S)
 
     @command
     def camera(
@@ -299,14 +211,14 @@ class Commands:
         return Ask(m.SetCamera(settings=settings), lambda a: expect(a.reply, m.Camera).settings)
 
     @command
-    def light(self, name: str, on: bool) -> Ask[m.AnyReply]:
+    def light(self, name: str, on: bool) -> Ask[str]:
         """Switch a light."""
-        return Ask(m.SetLight(name=name, on=on), _whatever)
+        return Ask(m.SetLight(name=name, on=on), message_of)
 
     @command
-    def dark(self) -> Ask[m.AnyReply]:
+    def dark(self) -> Ask[str]:
         """End manual work: projector dark, lights off, stage held."""
-        return Ask(m.Dark(), _whatever)
+        return Ask(m.Dark(), message_of)
 
     @command
     def lock(self, owner: str, note: str = "", lease_s: float = 10.0) -> Ask[m.Locked]:
@@ -316,82 +228,11 @@ class Commands:
         )
 
     @command
-    def renew_lock(self) -> Ask[m.AnyReply]:
+    def renew_lock(self) -> Ask[m.Locked]:
         """The heartbeat of this client's lock."""
-        return Ask(m.RenewLock(), _whatever)
+        return Ask(m.RenewLock(), lambda a: expect(a.reply, m.Locked))
 
     @command
-    def unlock(self, *, force: bool = False) -> Ask[m.AnyReply]:
+    def unlock(self, *, force: bool = False) -> Ask[str]:
         """Give the rig back; `force` breaks another's lock."""
-        return Ask(m.Unlock(force=force), _whatever)
-
-
-# ---------------------------------------------------------------- following a run
-
-
-class Following:
-    """What a run's progress is, from snapshots and events.
-
-    A snapshot is asked for first, on a gap, on a new epoch, and on silence; events that a snapshot
-    already holds are passed over.
-    """
-
-    def __init__(self, run: str) -> None:
-        self.run = run
-        self.last: Progress | None = None
-        self._epoch = ""
-        self._held: dict[str, int] = {}
-
-    @property
-    def ended(self) -> bool:
-        """Whether there is nothing more to come."""
-        return self.last is not None and self.last.state.ended
-
-    def snapshot(self, status: m.Status, info: RunInfo) -> Progress | None:
-        """The progress as of a snapshot, if that is news."""
-        self._epoch, self._held = status.epoch, dict(status.sequences)
-        there = status.progress
-        if there is not None and there.run == self.run and there.state == info.state:
-            return self._news(there)
-        return self._news(self._of(info))
-
-    def needs_snapshot(self, epoch: str, gap: bool) -> bool:
-        """Whether an event says that the last snapshot is not enough any more."""
-        return gap or epoch != self._epoch
-
-    def event(self, event: m.Event) -> Progress | None:
-        """The progress after an event, if that is news of this run."""
-        if event.sequence <= self._held.get(event.topic, -1):
-            return None
-        match event.body:
-            case m.Progressed(progress=progress) if progress.run == self.run:
-                return self._news(progress)
-            case m.RunChanged(run=info) if info.id == self.run:
-                return self._news(self._of(info))
-        return None
-
-    def _of(self, info: RunInfo) -> Progress:
-        """A run's own figures; what only the daemon's progress knows is kept from the last one."""
-        last = self.last
-        return Progress(
-            run=info.id,
-            state=info.state,
-            recorded=info.recorded,
-            planned=info.planned,
-            missing=info.missing,
-            rejected=info.rejected,
-            fraction=1.0 if info.state is RunState.DONE else last.fraction if last else None,
-            rate_hz=last.rate_hz if last and not info.state.ended else 0.0,
-            remaining_s=0.0 if info.state.ended else last.remaining_s if last else None,
-            phase=info.end.reason if info.end else info.state.value,
-            summary=last.summary if last else {},
-        )
-
-    def _news(self, progress: Progress) -> Progress | None:
-        if progress == self.last:
-            return None
-        self.last = progress
-        return progress
-
-
-__all__ = ["Commands", "Following", "Part", "Picture", "Role", "Separation", "command"]
+        return Ask(m.Unlock(force=force), message_of)

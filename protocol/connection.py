@@ -11,8 +11,10 @@ the last attempt the error is UNREACHABLE.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import re
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -50,22 +52,32 @@ EVENTS_HWM = 1000
 PREVIEWS_HWM = 4
 """Previews that wait for a slow reader; beyond, they are lost. Only the newest is handed on."""
 
+_LOOPBACK = re.compile(r"localhost|127(\.\d+){3}|\[::1\]")
+
 log = logging.getLogger("umbra")
 
 T = TypeVar("T")
 R = TypeVar("R", bound=Reply)
+S = TypeVar("S", bound="zmq.Socket[Any]")
 _responses = msgspec.json.Decoder(Response)
 _events = msgspec.json.Decoder(Event)
 
 
-class _Peek(msgspec.Struct):
+class _Glance(msgspec.Struct):
     """What can be read of any version's response."""
 
     id: str = ""
-    reply: dict[str, Any] | None = None
+    reply: msgspec.Raw = msgspec.Raw(b"null")
 
 
-_peeks = msgspec.json.Decoder(_Peek)
+class _Versions(msgspec.Struct):
+    """What can be read of any version's welcome."""
+
+    protocol: int = PROTOCOL
+    server: str = "?"
+
+
+_glances = msgspec.json.Decoder(_Glance)
 
 # ---------------------------------------------------------------- where
 
@@ -86,8 +98,8 @@ def chosen_endpoint(endpoint: str | None) -> str:
 def is_local(endpoint: str) -> bool:
     """Whether an endpoint is on this machine and cannot be reached from another."""
     scheme, _, rest = endpoint.partition("://")
-    host = rest.rpartition(":")[0].strip("[]")
-    return scheme == "ipc" or host == "localhost" or host.startswith("127.") or host == "::1"
+    host = rest.rpartition(":")[0]
+    return scheme == "ipc" or _LOOPBACK.fullmatch(host) is not None
 
 
 def events_endpoint(welcome: Welcome, reached: str) -> str:
@@ -115,16 +127,14 @@ def unreachable(endpoint: str, timeout_s: float, keys: ClientKeys | None) -> Umb
 # ---------------------------------------------------------------- sockets
 
 
-def _secure(socket: zmq.Socket[bytes], keys: ClientKeys | None) -> None:
+def _secure(socket: zmq.Socket[Any], keys: ClientKeys | None) -> None:
     if keys is not None:
         socket.curve_publickey = keys.public
         socket.curve_secretkey = keys.secret
         socket.curve_serverkey = keys.server
 
 
-def dealer(
-    context: zmq.Context[zmq.Socket[bytes]], endpoint: str, keys: ClientKeys | None
-) -> zmq.Socket[bytes]:
+def dealer(context: zmq.Context[S], endpoint: str, keys: ClientKeys | None) -> S:
     """A socket for requests: it holds nothing back for a peer that isn't there."""
     socket = context.socket(zmq.DEALER)
     socket.linger = 0
@@ -136,12 +146,12 @@ def dealer(
 
 
 def subscriber(
-    context: zmq.Context[zmq.Socket[bytes]],
+    context: zmq.Context[S],
     endpoint: str,
     keys: ClientKeys | None,
     topics: Sequence[str],
     hwm: int,
-) -> zmq.Socket[bytes]:
+) -> S:
     """A socket for events, with a bounded queue."""
     socket = context.socket(zmq.SUB)
     socket.linger = 0
@@ -208,10 +218,11 @@ class Exchange(Generic[T]):
             response = decode(_responses, frames[0].buffer)
             arrays = arrays_of(response.arrays, [frame.buffer for frame in frames[1:]])
         except UmbraError as error:
-            peek = _peeks.decode(frames[0].buffer)
-            theirs = (peek.reply or {}).get("protocol", PROTOCOL)
-            if theirs != PROTOCOL:
-                raise mismatch(theirs, (peek.reply or {}).get("server", "?")) from error
+            with contextlib.suppress(msgspec.DecodeError):
+                reply = _glances.decode(frames[0].buffer).reply
+                their = msgspec.json.decode(reply, type=_Versions)
+                if their.protocol != PROTOCOL:
+                    raise mismatch(their.protocol, their.server) from error
             raise UmbraError(
                 Code.INTERNAL, f"the daemon's answer can't be read: {error}", error.where
             ) from error
@@ -225,7 +236,7 @@ class Exchange(Generic[T]):
 def id_of(frames: Sequence[zmq.Frame]) -> str:
     """The id that a message answers; "" (and a log record) where it cannot be read."""
     try:
-        return _peeks.decode(frames[0].buffer).id
+        return _glances.decode(frames[0].buffer).id
     except msgspec.DecodeError as error:
         log.warning("ignored a message that is no response: %s", error)
         return ""

@@ -495,6 +495,35 @@ AnyReply = (
     | Locked | Done
 )  # fmt: skip
 
+ANSWERS: dict[type[Command], type[Reply]] = {
+    Hello: Welcome,
+    GetStatus: Status,
+    GetDevices: Devices,
+    Submit: Run,
+    GetQueue: Runs,
+    MoveQueued: Runs,
+    Pause: Run,
+    Resume: Run,
+    Abort: Run,
+    EStop: Done,
+    Reset: Done,
+    ListRuns: Runs,
+    GetRun: Run,
+    GetResult: Result,
+    GetProduct: ProductPart,
+    GetLog: Log,
+    GetPreview: Picture,
+    Show: Done,
+    Snap: Picture,
+    SetCamera: Camera,
+    SetLight: Done,
+    Dark: Done,
+    Lock: Locked,
+    RenewLock: Locked,
+    Unlock: Done,
+}
+"""What each command is answered with, unless with an error."""
+
 
 # ---------------------------------------------------------------- events
 
@@ -584,7 +613,7 @@ class Response(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Event(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An event's header. `sequence` counts within the topic and epoch, without gaps."""
+    """An event's header. `sequence` counts from 1 within topic and epoch, without gaps."""
 
     topic: str
     sequence: int

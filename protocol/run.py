@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import html
-import os
-import tempfile
 import time
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, BinaryIO
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from protocol.commands import Following, Separation
+from protocol.arrivals import place_in
 from protocol.errors import Code, UmbraError
-from protocol.messages import Product, Progress, RunInfo, RunState
+from protocol.following import SILENCE_S, Following
+from protocol.messages import Progress, RunInfo, RunState
+from protocol.results import Separation
 
 if TYPE_CHECKING:
     from protocol.client import Client
-
-SILENCE_S = 1.0
-"""Without an event for so long, the rig is asked: a daemon that is gone is noticed so."""
 
 
 def failure(info: RunInfo) -> UmbraError:
@@ -60,24 +56,7 @@ class Run:
         Where events were lost or the daemon restarted, the next one is from a snapshot. Raises
         UmbraError(unreachable) when the rig is gone.
         """
-        following = Following(self.id)
-        with self._rig.subscribe("run", "progress") as events:
-            news = self._snapshot(following)
-            while True:
-                if news is not None:
-                    yield news
-                if following.ended:
-                    break
-                notice = events.next(SILENCE_S)
-                if notice is None or following.needs_snapshot(notice.event.epoch, notice.gap):
-                    news = self._snapshot(following)
-                else:
-                    news = following.event(notice.event)
-        self.refresh()
-
-    def _snapshot(self, following: Following) -> Progress | None:
-        status = self._rig.status()
-        return following.snapshot(status, self.refresh())
+        return self._followed(("run", "progress"), until=None)
 
     def wait(self, timeout_s: float | None = None, *, check: bool = True) -> RunInfo:
         """Wait until the run has ended.
@@ -86,22 +65,34 @@ class Run:
         not end well: failed, aborted, interrupted.
         """
         until = None if timeout_s is None else time.monotonic() + timeout_s
+        for _ in self._followed(("run",), until):
+            pass
+        if not self.state.ended:
+            raise TimeoutError(f"run {self.id} is {self.state} after {timeout_s:g} s")
+        if check and self.state is not RunState.DONE:
+            raise failure(self.info)
+        return self.info
+
+    def _followed(self, topics: tuple[str, ...], until: float | None) -> Iterator[Progress]:
         following = Following(self.id)
-        with self._rig.subscribe("run") as events:
-            self._snapshot(following)
-            while not following.ended:
+        with self._rig.subscribe(*topics) as events:
+            news = self._snapshot(following)
+            while True:
+                if news is not None:
+                    yield news
                 left = SILENCE_S if until is None else min(SILENCE_S, until - time.monotonic())
-                if left <= 0:
-                    raise TimeoutError(f"run {self.id} is {self.state} after {timeout_s:g} s")
+                if following.ended or left <= 0:
+                    break
                 notice = events.next(left)
-                if notice is None or following.needs_snapshot(notice.event.epoch, notice.gap):
-                    self._snapshot(following)
+                if notice is None or following.outdated_by(notice.event):
+                    news = self._snapshot(following)
                 else:
-                    following.event(notice.event)
-        info = self.refresh()
-        if check and info.state is not RunState.DONE:
-            raise failure(info)
-        return info
+                    news = following.event(notice.event)
+        self.refresh()
+
+    def _snapshot(self, following: Following) -> Progress | None:
+        status = self._rig.status()
+        return following.snapshot(status, self.refresh())
 
     def result(self, *, check: bool = True) -> Separation:
         """Direct and global as they are now; final when the run is done.
@@ -115,8 +106,10 @@ class Run:
 
     def save(self, folder: Path | str) -> list[Path]:
         """Fetch all products into a folder, which is made; the files written."""
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        return [self._rig.download(self.id, p.name, folder) for p in self.refresh().products]
+        return [
+            self._rig.download(self.id, product.name, place_in(folder, product))
+            for product in self.refresh().products
+        ]
 
     def pause(self) -> None:
         """Pause after the step under way."""
@@ -143,45 +136,3 @@ def described(info: RunInfo, *, with_id: bool = True) -> str:
     frames = f"{info.recorded}/{info.planned}" if info.planned else f"{info.recorded}"
     end = f", {info.end.reason}" if info.end and info.end.reason else ""
     return f"{info.id + ': ' if with_id else ''}{method}, {info.state.value}, {frames} frames{end}"
-
-
-# ---------------------------------------------------------------- files that arrive
-
-
-class PartFile:
-    """A file that is not there until it is whole."""
-
-    def __init__(self, path: Path, file: BinaryIO) -> None:
-        self._path, self._file = path, file
-
-    def write(self, data: memoryview) -> None:
-        """Add to it."""
-        self._file.write(data)
-
-    def finish(self, size: int) -> None:
-        """Put it in its place. Raises UmbraError(storage_failed) if it is not whole."""
-        if (got := self._file.tell()) != size:
-            raise UmbraError(
-                Code.STORAGE_FAILED, f"{self._path.name}: {got} bytes of {size} came; try again"
-            )
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        Path(self._file.name).replace(self._path)
-
-
-@contextlib.contextmanager
-def part_file(path: Path) -> Iterator[PartFile]:
-    """A new file beside its place; gone again unless it was finished."""
-    with tempfile.NamedTemporaryFile(
-        dir=path.parent, prefix=f".{path.name}.", suffix=".part", delete=False
-    ) as file:
-        try:
-            yield PartFile(path, file)  # type: ignore[arg-type]
-        finally:
-            Path(file.name).unlink(missing_ok=True)
-
-
-def target(to: Path | str, product: Product) -> Path:
-    """Where a product goes: the path itself, or its own file name in a folder."""
-    path = Path(to)
-    return path / PurePosixPath(product.file).name if path.is_dir() else path

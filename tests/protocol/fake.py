@@ -232,7 +232,7 @@ class FakeRig:
                 return m.Devices(devices=()), {}
             case m.Submit(spec=spec, by=by):
                 return m.Run(run=self._submitted(spec, by)), {}
-            case m.GetQueue() | m.ListRuns():
+            case m.GetQueue() | m.ListRuns() | m.MoveQueued():
                 return m.Runs(runs=tuple(self.runs.values())), {}
             case m.GetRun(run=run) | m.Pause(run=run) | m.Resume(run=run):
                 return m.Run(run=self._run(run)), {}
@@ -268,6 +268,7 @@ class FakeRig:
                     self.lock = None
                 else:
                     self.renewed.set()
+                    return self.lock, {}
         return m.Done(), {}
 
     def _submitted(self, spec: AnyScan, by: str) -> RunInfo:
