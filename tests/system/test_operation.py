@@ -132,8 +132,7 @@ def test_a_held_rig_is_held(daemon: Daemon) -> None:
     "fault", ["drop-trigger@9", "duplicate-frame@9", "incomplete-frame@9", "timeout@9"]
 )
 def test_a_frame_that_went_wrong_is_exposed_again(daemon: Daemon, fault: str) -> None:
-    daemon.configure(camera=f'faults = ["{fault}"]', more="[sequencer]
-frame_timeout_s = 0.3")
+    daemon.configure(camera=f'faults = ["{fault}"]', more="[sequencer]\nframe_timeout_s = 0.3")
     with daemon.start() as rig:
         info = rig.scan(umbra.Checkerboard()).wait(60)
         assert (info.state, info.recorded, info.missing) == (RunState.DONE, 27, 0)
