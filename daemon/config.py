@@ -13,7 +13,6 @@ from msgspec import Meta
 from drivers import registry
 from protocol.messages import DEFAULT_COMMAND, DEFAULT_EVENTS
 
-
 _T = TypeVar("_T")
 
 

@@ -41,6 +41,8 @@ _PROGRESS_S = 0.1
 _ROOM_S = 1.0
 _RATE_FRAMES = 20
 _RESULT_S = 30.0
+_STILL_S = 60.0
+"""A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
 
 log = structlog.get_logger(__name__)
 
@@ -56,6 +58,7 @@ class Course:
     def __init__(
         self,
         folder: RunFolder,
+        *,
         rig: Rig,
         store: Store,
         config: RigConfig,
@@ -78,6 +81,7 @@ class Course:
         self._told = 0.0
         self._room_seen = 0.0
         self._timings: dict[str, float] = {}
+        self._exposure_s = 0.0
         self.beat = time.monotonic()
 
     # ------------------------------------------------------------ for others
@@ -115,6 +119,12 @@ class Course:
         except NotYet as error:
             raise UmbraError(Code.NO_RESULT, str(error)) from error
 
+    @property
+    def alive(self) -> bool:
+        """Whether it has moved lately; a pause, and the making of products, count as moving."""
+        at_rest = self.control.paused or self.folder.file.state is not RunState.RUNNING
+        return at_rest or time.monotonic() - self.beat < _STILL_S + 2 * self._exposure_s
+
     def _rate(self) -> float:
         moments = list(self._moments)
         if len(moments) < 2 or moments[-1][0] == moments[0][0]:
@@ -134,7 +144,7 @@ class Course:
             end = self.control.verdict or End(
                 state=RunState.INTERRUPTED, reason="the devices were taken away"
             )
-        except Exception as error:  # noqa: BLE001 - a run may fail, the daemon may not
+        except Exception as error:
             if isinstance(error, DeviceError):
                 self._rig.failed(error)
             known = as_error(error)
@@ -145,8 +155,9 @@ class Course:
             )
         finally:
             if session is not None:
-                if not session.ended.is_set():
-                    self._rig.safe_within(self._rig.make_safe(), SAFE_S)
+                # Whoever revoked the session has sent the devices there already: this waits.
+                futures = self._rig.make_safe(halt=not session.ended.is_set())
+                self._rig.safe_within(futures, SAFE_S)
                 self._rig.leave(session)
         self._close(end)
         return end
@@ -180,7 +191,7 @@ class Course:
             self._timings["prepare_s"] = time.monotonic() - began
             scanning = self._rig.clock.now_ns()
             try:
-                self._sequence(session, method, recorder, ring, step, sub)
+                self._sequence(session, method, recorder, ring, (step, sub))
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.
                 recorder.finish()
@@ -188,7 +199,7 @@ class Course:
             self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
             truth = self._rig.camera.call(lambda c: c.truth(), CALL_S, session)
             self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
-            return self._conclude(method, recorder, info, truth)
+            return self._conclude(recorder, info, truth)
         finally:
             frames.close()
 
@@ -198,8 +209,7 @@ class Course:
         method: Method[Any],
         recorder: Recorder,
         ring: Ring,
-        step: int,
-        sub: int,
+        start: tuple[int, int],
     ) -> None:
         try:
             Sequencer(
@@ -212,7 +222,7 @@ class Course:
                 patience=self._config.sequencer,
                 may_go_on=self._may_go_on,
                 on_pause=self._paused,
-            ).run(step, sub, recorder.tally.taken)
+            ).run(*start, taken=recorder.tally.taken)
         except Behind as error:
             raise UmbraError(
                 Code.STORAGE_FAILED,
@@ -231,6 +241,7 @@ class Course:
             wanted = CameraSettings(exposure_us=known["exposure_us"], gain=known["gain"])
         camera = self._rig.camera
         in_force = camera.call(lambda c: c.configure(wanted), CALL_S, session)
+        self._exposure_s = (in_force.exposure_us or 0.0) * 1e-6
         return {"exposure_us": in_force.exposure_us, "gain": in_force.gain}
 
     def _same_devices(self, before: Mapping[str, Any]) -> None:
@@ -323,15 +334,11 @@ class Course:
         self._on_change()
 
     def _count(self, tally: Tally) -> None:
-        self.folder.update(
-            recorded=tally.recorded, missing=tally.missing, rejected=tally.rejected
-        )
+        self.folder.update(recorded=tally.recorded, missing=tally.missing, rejected=tally.rejected)
 
     # ------------------------------------------------------------ after
 
-    def _conclude(
-        self, method: Method[Any], recorder: Recorder, info: CameraInfo, truth: Mapping[str, Any]
-    ) -> End:
+    def _conclude(self, recorder: Recorder, info: CameraInfo, truth: Mapping[str, Any]) -> End:
         self._update(state=RunState.FINISHING)
         self._say("writing products")
         began = time.monotonic()
@@ -342,6 +349,7 @@ class Course:
             self.folder,
             components,
             full_scale=info.pixel_format.full_scale,
+            pixel_format=info.pixel_format,
             frame=self._viewfinder.picture(),
             truth=truth,
             timings={**self._timings, "rate_hz": self._rate()},

@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 import structlog
@@ -26,6 +27,7 @@ from daemon.ring import Buffer, Ring
 from daemon.scans.method import Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, NotYet
 from drivers.base import Frame
+from drivers.clock import NS
 
 _GROUP_FRAMES = 16
 _GROUP_S = 0.25
@@ -60,6 +62,11 @@ class Tally:
     def taken(self) -> int:
         """Frames that the plan need not expose again."""
         return self.recorded + self.missing
+
+
+def _iso(utc_ns: int) -> str:
+    """UTC nanoseconds as ISO 8601, to the microsecond."""
+    return datetime.fromtimestamp(utc_ns / NS, UTC).isoformat(timespec="microseconds")
 
 
 class Recorder:
@@ -246,7 +253,7 @@ class Recorder:
             sequence=frame.sequence if frame else -1,
             start_ns=frame.start_ns if frame else 0,
             end_ns=frame.end_ns if frame else 0,
-            utc_ns=frame.utc_ns if frame else 0,
+            utc=_iso(frame.utc_ns) if frame else "",
             exposure_us=frame.exposure_us if frame else 0.0,
             gain=frame.gain if frame else 0.0,
             source=frame.source if frame else "",

@@ -29,7 +29,7 @@ class Glimpse:
 
 
 class Viewfinder:
-    """Keeps the newest glimpse; thread-safe. `on_glimpse` is called for each, at most 4 a second."""
+    """Keeps the newest glimpse; thread-safe. `on_glimpse` is told each, at most 4 a second."""
 
     def __init__(self, on_glimpse: Callable[[Glimpse], None]) -> None:
         self._on_glimpse = on_glimpse

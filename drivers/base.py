@@ -125,11 +125,12 @@ class Device(ABC):
 
 
 class PixelFormat(enum.StrEnum):
-    """SFNC PixelFormat names that Umbra understands; 10 and 12 bit come unpacked and unshifted."""
+    """SFNC PixelFormat names that Umbra understands; 10 to 14 bit come unpacked and unshifted."""
 
     MONO8 = "Mono8"
     MONO10 = "Mono10"
     MONO12 = "Mono12"
+    MONO14 = "Mono14"
     MONO16 = "Mono16"
     BAYER_RG8 = "BayerRG8"
     BAYER_GR8 = "BayerGR8"
@@ -143,11 +144,18 @@ class PixelFormat(enum.StrEnum):
     BAYER_GR12 = "BayerGR12"
     BAYER_GB12 = "BayerGB12"
     BAYER_BG12 = "BayerBG12"
+    BAYER_RG14 = "BayerRG14"
+    BAYER_GR14 = "BayerGR14"
+    BAYER_GB14 = "BayerGB14"
+    BAYER_BG14 = "BayerBG14"
     BAYER_RG16 = "BayerRG16"
     BAYER_GR16 = "BayerGR16"
     BAYER_GB16 = "BayerGB16"
     BAYER_BG16 = "BayerBG16"
     RGB8 = "RGB8"
+    RGB10 = "RGB10"
+    RGB12 = "RGB12"
+    RGB14 = "RGB14"
     RGB16 = "RGB16"
 
     @property
