@@ -56,9 +56,9 @@ def connect(
 ) -> Client:
     """Connect to a rig: the endpoint given, or UMBRA_RIG's, or the one on this machine.
 
-    `keys` are a client's keys or their folder; without, see `ClientKeys.default`. `timeout_s` is
-    how long an answer may take, repeats included. Raises UmbraError: unreachable,
-    version_mismatch, bad_keys.
+    `keys` are a client's keys or their folder; without, see `ClientKeys.default`; False is none at
+    all. `timeout_s` is how long an answer may take, repeats included. Raises UmbraError:
+    unreachable, version_mismatch, bad_keys, and bad_request for what is no endpoint.
     """
     return Client(endpoint, keys=keys, timeout_s=timeout_s, name=name)
 

@@ -194,6 +194,17 @@ def _doc(cls: type) -> str:
 # ---------------------------------------------------------------- tables
 
 
+def _described(kind: mi.Type) -> str:
+    """What the type itself says of the field (Meta's description)."""
+    match kind:
+        case mi.Metadata(type=inner, extra_json_schema=schema):
+            return str((schema or {}).get("description", "")) or _described(inner)
+        case mi.UnionType(types=types):
+            return next(filter(None, map(_described, types)), "")
+        case _:
+            return ""
+
+
 def _default(field: mi.Field) -> str:
     if field.required:
         return "required"
@@ -213,7 +224,8 @@ def _field_table(cls: Struct) -> Iterator[str]:
     yield "| field | type | default | |"
     yield "| --- | --- | --- | --- |"
     for field in info.fields:
-        remark = remarks.get(field.name, "")
+        said = (_described(field.type), remarks.get(field.name, ""))
+        remark = "; ".join(filter(None, said)).replace("None:", "`null`:")
         yield f"| `{field.encode_name}` | {_type(field.type)} | {_default(field)} | {remark} |"
 
 

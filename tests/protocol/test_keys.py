@@ -148,6 +148,20 @@ def test_which_keys_are_used_where_none_were_named(
         assert named.name == "env"
 
 
+def test_no_keys_at_all_where_there_are_some(
+    fake: FakeRig,
+    connect: Connect,
+    server: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("UMBRA_KEYS", str(client_folder(tmp_path / "env", "env", server)))
+    with pytest.raises(UmbraError, match="keys it doesn't allow"):
+        connect(fake.endpoint, timeout_s=0.3)  # the rig speaks plainly
+    with connect(fake.endpoint, keys=False) as rig:
+        assert rig.status().rig == "fake"
+
+
 # ---------------------------------------------------------------- the allow-list
 
 
