@@ -17,7 +17,7 @@ help:  ## say what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):[^#]*## (.*)/make \1\t\2/' | expand -t 16
 
 demo: $(VENV)/.runtime  ## a scan on the virtual rig, with its result in demo-out
-	$(BIN)/umbra demo -o demo-out $(ARGS)
+	$(BIN)/umbra demo -o demo-out --force $(ARGS)
 
 test: $(VENV)/.dev  ## the whole suite; ARGS="-k name" for a part of it
 	$(BIN)/python -m pytest $(ARGS)

@@ -155,8 +155,9 @@ class Course:
             )
         finally:
             if session is not None:
-                if not session.ended.is_set():
-                    self._rig.safe_within(self._rig.make_safe(), SAFE_S)
+                # Whoever revoked the session has sent the devices there already: this waits.
+                futures = self._rig.make_safe(halt=not session.ended.is_set())
+                self._rig.safe_within(futures, SAFE_S)
                 self._rig.leave(session)
         self._close(end)
         return end

@@ -6,12 +6,14 @@ from typing import Any
 
 from daemon.scans.checkerboard import CheckerboardMethod
 from daemon.scans.method import Bench, Method, Unsuitable
+from daemon.scans.stick import StickMethod
 from daemon.scans.two_image import TwoImageMethod
-from protocol.scans import AnyScan, Checkerboard, TwoImage
+from protocol.scans import AnyScan, Checkerboard, Stick, TwoImage
 
 _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     Checkerboard: CheckerboardMethod,
     TwoImage: TwoImageMethod,
+    Stick: StickMethod,
 }
 
 NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())

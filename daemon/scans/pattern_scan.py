@@ -14,7 +14,7 @@ from protocol.scans import PatternScan, Radiometry, Reference
 
 P = TypeVar("P", bound=PatternScan)
 
-_REFERENCES: dict[Reference, tuple[AnyPattern | None, Lighting]] = {
+REFERENCES: dict[Reference, tuple[AnyPattern | None, Lighting]] = {
     Reference.AMBIENT: (None, Lighting.AMBIENT),
     Reference.BLACK: (BLACK, Lighting.BLACK),
     Reference.WHITE: (WHITE, Lighting.WHITE),
@@ -70,7 +70,7 @@ class PatternMethod(Method[P]):
         frames = 1 if recorded else self.spec.average
         return [
             Expose(pattern, lighting, frames=frames)
-            for pattern, lighting in (_REFERENCES[name] for name in wanted)
+            for pattern, lighting in (REFERENCES[name] for name in wanted)
         ]
 
     def _exposures(self, pattern_set: Sequence[AnyPattern]) -> list[Expose]:

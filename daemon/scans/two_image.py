@@ -44,4 +44,9 @@ class TwoImageMethod(PatternMethod[TwoImage]):
 
     def estimator(self) -> Estimator:
         """See `Method`."""
-        return ComplementPair(self.response, lit_fraction=self.lit_fraction, leakage=self.leakage)
+        return ComplementPair(
+            self.response,
+            lit_fraction=self.lit_fraction,
+            leakage=self.leakage,
+            average=self.spec.average,
+        )

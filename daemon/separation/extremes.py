@@ -16,6 +16,7 @@ from daemon.separation.estimator import Components, Lighting, NotYet, Observatio
 from daemon.separation.finish import finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
+from daemon.separation.scan_noise import ScanNoise
 
 
 class MaxMin:
@@ -33,6 +34,7 @@ class MaxMin:
         self._leakage = leakage
         self._references = References(response)
         self._mean = FrameMean(response) if average > 1 else None
+        self._noise = ScanNoise(response, average)
         self._open: int | None = None  # the pattern being averaged
         self._max: NDArray[Any] | None = None
         self._min: NDArray[Any] | None = None
@@ -52,6 +54,8 @@ class MaxMin:
             return
         if self._mean is None:
             if observation.used:
+                if self._max is None:
+                    self._noise.add(pixels, observation.pattern)
                 self._compare(pixels)
             else:
                 self._unused += 1
@@ -64,6 +68,7 @@ class MaxMin:
         self._open = observation.pattern
         if observation.used:
             mean.add(pixels)
+            self._noise.add(pixels, observation.pattern)
             if self._saturated is None:
                 self._saturated = np.zeros(pixels.shape, dtype=np.bool_)
             self._saturated |= pixels >= self._response.saturated_from
@@ -103,15 +108,17 @@ class MaxMin:
             direct,
             indirect,
             response=self._response,
-            saturated=saturated,
-            picture=darkest,
             brightest=brightest,
+            deviation=self._noise.deviation(brightest),
+            saturated=saturated,
+            samples=self._patterns,
             facts={
                 "estimator": "maxmin",
                 "patterns": self._patterns,
                 "unused_frames": self._unused,
                 "lit_fraction": self._alpha,
                 "leakage": self._leakage,
+                "noise_from": self._noise.source,
                 **self._references.facts(source),
             },
         )

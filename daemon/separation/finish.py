@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation import mosaic, noise
+from daemon.separation import mosaic
 from daemon.separation.estimator import Components, Quality
+from daemon.separation.noise import noise_range
 from daemon.separation.radiometry import Plane, Response
-
-SIGNIFICANT = 3.0
-"""How many standard deviations tell a value from noise."""
 
 _BINS = 64
 
@@ -22,31 +20,37 @@ def finish(
     indirect: Plane,
     *,
     response: Response,
-    saturated: NDArray[np.bool_],
-    picture: Plane,
     brightest: Plane,
+    deviation: Plane,
+    saturated: NDArray[np.bool_],
+    samples: int,
     facts: dict[str, Any],
     flags: NDArray[np.uint16] | None = None,
     planes: dict[str, NDArray[Any]] | None = None,
 ) -> Components:
     """Judge the samples' components, then make colours of a mosaic.
 
-    `direct`, `indirect`, `saturated` have the shape of a frame; `picture` is one in which noise can
-    be measured, `brightest` each sample's brightest light (both linear, ambient included); `flags`
-    (H, W) are the method's own bits.
+    `direct`, `indirect`, `brightest` (linear light, ambient included), its standard `deviation` and
+    `saturated` have the shape of a frame; `samples` were compared for each extreme;
+    `flags` (H, W) are the method's own bits, of which NEVER_LIT and NEVER_UNLIT make both
+    components NaN.
     """
-    camera = measure_noise(picture, response)
-    deviation = camera.deviation(brightest)
-    quality = judge(direct, indirect, saturated, deviation)
+    quality = judge(direct, indirect, saturated, deviation, noise_range(samples))
     if flags is not None:
         quality |= flags
+    unknown = quality & np.uint16(Quality.NEVER_LIT | Quality.NEVER_UNLIT) != 0
+    direct[unknown] = np.nan
+    indirect[unknown] = np.nan
+    quality[unknown] &= np.uint16(~(Quality.LOW_MODULATION | Quality.NEGATIVE) & 0xFFFF)
     if response.bayer:
         # A colour is interpolated from its neighbours: what is wrong with them is wrong with it.
         quality = spread(quality, Quality.SATURATED)
         direct, indirect = (mosaic.demosaic(x, response.bayer) for x in (direct, indirect))
+        direct[unknown] = np.nan
+        indirect[unknown] = np.nan
     figures = {
         **facts,
-        "noise_counts": round(camera.read, 4),
+        "noise_counts": round(float(np.nanmedian(deviation)), 4),
         "black_level": response.black,
         "tone": response.tone,
         "full_scale": response.full_scale,
@@ -57,34 +61,28 @@ def finish(
     return Components(direct, indirect, quality, dict(planes or {}), figures)
 
 
-def measure_noise(picture: Plane, response: Response) -> noise.Noise:
-    """The camera's noise in linear counts, from the quietest channel of a picture."""
-    quantum = float(np.median(response.slope(picture[::8, ::8])))
-    if picture.ndim == 2:
-        return noise.from_picture(picture, quantum, step=2 if response.bayer else 1)
-    channels = [
-        noise.from_picture(np.ascontiguousarray(picture[..., c]), quantum) for c in range(3)
-    ]
-    return max(channels, key=lambda one: one.read)
-
-
 def judge(
-    direct: Plane, indirect: Plane, saturated: NDArray[np.bool_], deviation: Plane
+    direct: Plane,
+    indirect: Plane,
+    saturated: NDArray[np.bool_],
+    deviation: Plane,
+    spread_of_noise: float,
 ) -> NDArray[np.uint16]:
     """Quality bits of each pixel (H, W) uint16 that follow from values and noise alone.
 
     A pixel is dark or of low modulation when each of its channels is; saturated or negative when
-    one of them is.
+    one of them is. `spread_of_noise` is how far apart noise alone drives the extremes, in
+    deviations.
     """
-    limit = np.float32(SIGNIFICANT) * deviation
+    limit = np.float32(spread_of_noise) * deviation
     with np.errstate(invalid="ignore"):
         dark = _every(direct + indirect < limit)
         flat = _every(direct < limit)
-        negative = _some((direct < -limit) | (indirect < -limit))
-    quality = noise.bits(_some(saturated), Quality.SATURATED)
-    quality |= noise.bits(dark, Quality.DARK)
-    quality |= noise.bits(flat, Quality.LOW_MODULATION)
-    quality |= noise.bits(negative, Quality.NEGATIVE)
+        negative = _some((direct < -limit) | (indirect < -2 * limit))
+    quality = bits(_some(saturated), Quality.SATURATED)
+    quality |= bits(dark, Quality.DARK)
+    quality |= bits(flat, Quality.LOW_MODULATION)
+    quality |= bits(negative, Quality.NEGATIVE)
     return quality
 
 
@@ -96,7 +94,12 @@ def spread(quality: NDArray[np.uint16], flag: Quality) -> NDArray[np.uint16]:
     for y in range(3):
         for x in range(3):
             near |= padded[y : y + height, x : x + width]
-    return quality | noise.bits(near, flag)
+    return quality | bits(near, flag)
+
+
+def bits(mask: NDArray[np.bool_], flag: Quality) -> NDArray[np.uint16]:
+    """A mask as a plane of one quality bit (uint16)."""
+    return mask.astype(np.uint16) * np.uint16(flag)
 
 
 def count(quality: NDArray[np.uint16]) -> dict[str, dict[str, float]]:

@@ -12,18 +12,22 @@ from daemon.separation.estimator import Components, Lighting, NotYet, Observatio
 from daemon.separation.finish import finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
+from daemon.separation.scan_noise import ScanNoise
 
 
 class ComplementPair:
     """Two images -> direct, global. Frames of pattern 0 and of its complement, pattern 1, are
     averaged in linear light; both have come when there is a result."""
 
-    def __init__(self, response: Response, *, lit_fraction: float, leakage: float) -> None:
+    def __init__(
+        self, response: Response, *, lit_fraction: float, leakage: float, average: int = 1
+    ) -> None:
         self._response = response
         self._alpha = lit_fraction
         self._leakage = leakage
         self._references = References(response)
         self._means = (FrameMean(response), FrameMean(response))
+        self._noise = ScanNoise(response, average)
         self._saturated: NDArray[np.bool_] | None = None
         self._unused = 0
 
@@ -37,6 +41,7 @@ class ComplementPair:
             self._references.add(pixels, observation.lighting)
         else:
             self._means[observation.pattern].add(pixels)
+            self._noise.add(pixels, observation.pattern)
             if self._saturated is None:
                 self._saturated = np.zeros(pixels.shape, dtype=np.bool_)
             self._saturated |= pixels >= self._response.saturated_from
@@ -53,20 +58,23 @@ class ComplementPair:
         first, second = (mean.value() for mean in self._means)
         ambient, source = self._ambient(first, second)
         lit, unlit = (first, second) if ambient is None else (first - ambient, second - ambient)
+        brightest = np.maximum(first, second)
         direct, indirect = light_model.from_complement_pair(lit, unlit, self._alpha, self._leakage)
         return finish(
             direct,
             indirect,
             response=self._response,
+            brightest=brightest,
+            deviation=self._noise.deviation(brightest),
             saturated=self._saturated,
-            picture=np.minimum(first, second),
-            brightest=np.maximum(first, second),
+            samples=2,
             facts={
                 "estimator": "complement pair",
                 "patterns": 2,
                 "unused_frames": self._unused,
                 "lit_fraction": self._alpha,
                 "leakage": self._leakage,
+                "noise_from": self._noise.source,
                 **self._references.facts(source),
                 **self._residual(first, second),
             },

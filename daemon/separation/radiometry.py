@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.noise import Noise
+
 Plane = NDArray[np.float32]
 
 
@@ -65,13 +67,35 @@ class Response:
             return light
         return np.take(_table(self.full_scale, self.black, self.tone), counts)
 
-    def slope(self, light: Plane) -> Plane:
-        """Linear counts for one encoded count at a level of light (float32, same shape)."""
+    def linear_between(self, counts: Plane) -> Plane:
+        """As `linear`, for means of counts (float32): interpolated between whole counts."""
         if self.is_linear:
-            return np.ones_like(light)
-        table = _table(self.full_scale, self.black, self.tone)[: self.full_scale + 1]
-        slopes = np.gradient(table)
-        return np.interp(light, table, slopes).astype(np.float32)
+            return counts - np.float32(self.black)
+        table = self.table()
+        return np.interp(counts, np.arange(table.size), table).astype(np.float32)
+
+    def counts(self, light: Plane) -> Plane:
+        """Encoded counts (float32, not rounded) of linear light: the inverse of `linear`."""
+        if self.is_linear:
+            return light + np.float32(self.black)
+        table = self.table()
+        return np.interp(light, table, np.arange(table.size)).astype(np.float32)
+
+    def table(self) -> Plane:
+        """Linear light of each count from 0 to full scale."""
+        return _table(self.full_scale, self.black, self.tone)[: self.full_scale + 1]
+
+    def deviation(self, noise: Noise | None, counts: NDArray[Any]) -> Plane:
+        """Standard deviation of linear light at a level of encoded counts: float32, same shape.
+
+        None stands for the rounding of counts alone.
+        """
+        if noise is None:
+            noise = Noise((0.0, float(self.full_scale)), (12.0**-0.5,) * 2)
+        table = _deviations(self, noise)
+        if counts.dtype.kind == "u":
+            return np.take(table, counts, mode="clip")
+        return np.asarray(np.interp(counts, np.arange(table.size), table), dtype=np.float32)
 
 
 def decode(encoded: NDArray[np.float64], tone: str) -> NDArray[np.float64]:
@@ -111,6 +135,13 @@ def _table(full_scale: int, black: float, tone: str) -> Plane:
     table: Plane = ((decode(encoded, tone) - offset) * full_scale).astype(np.float32)
     table.setflags(write=False)
     return table
+
+
+@lru_cache(maxsize=16)
+def _deviations(response: Response, noise: Noise) -> Plane:
+    """Deviation of linear light for every count up to full scale."""
+    slope = np.gradient(response.table())
+    return noise.deviation(np.arange(response.full_scale + 1)) * slope.astype(np.float32)
 
 
 class FrameMean:

@@ -27,7 +27,6 @@ from protocol.messages import (
     Picture,
     Request,
     Role,
-    Runs,
     Snap,
 )
 
@@ -45,9 +44,7 @@ class Desk:
         self.router.bind("inproc://desk")
         self.client = self.context.socket(zmq.DEALER)
         self.client.connect("inproc://desk")
-        self.task = asyncio.create_task(
-            Server(self.router, self.handle, self.caller_of).serve()
-        )
+        self.task = asyncio.create_task(Server(self.router, self.handle, self.caller_of).serve())
 
     def caller_of(self, frame: zmq.Frame) -> Caller | None:
         return None if b"stranger" in frame.bytes else self.caller
