@@ -30,7 +30,7 @@ from daemon.manual import Manual
 from daemon.notify import Notifier
 from daemon.publisher import HIGH_WATER, Publisher
 from daemon.rig import Rig
-from daemon.runner import Runner
+from daemon.runner import LOCK, Runner
 from daemon.server import Server
 from daemon.store import Store
 from daemon.viewfinder import Glimpse, Viewfinder
@@ -132,6 +132,7 @@ class _Daemon:
                 viewfinder=viewfinder,
                 publish=publish,
                 on_activity=changed,
+                make_way=manual.make_way,
             )
             commands = Commands(
                 rig=rig,
@@ -217,6 +218,8 @@ class _Daemon:
         while True:
             rig.tend()
             manual.tend()
+            if manual.lock_info() is None:
+                runner.release(LOCK)
             status = self._status_line(runner)
             if status != told:
                 told = status

@@ -16,7 +16,7 @@ from daemon.logs import LogBook
 from daemon.manual import Manual
 from daemon.publisher import Publisher
 from daemon.rig import SAFE_S, Rig
-from daemon.runner import Runner
+from daemon.runner import LOCK, Runner
 from daemon.scans import catalog
 from daemon.separation.estimator import Components
 from daemon.server import Answer, Caller
@@ -155,7 +155,12 @@ class Commands:
         by = command.by or asked.caller.name
         # Writing run.json takes an fsync: not in the loop.
         run = await asyncio.to_thread(
-            self._runner.submit, command.spec, by, asked.request_id, first=command.first
+            self._runner.submit,
+            command.spec,
+            by,
+            asked.request_id,
+            first=command.first,
+            holder=self._manual.lock_info() is not None,
         )
         return _about(run)
 
@@ -325,6 +330,7 @@ class Commands:
         token = await self._by_hand(
             asked, lambda: self._manual.lock(command.owner, command.note, command.lease_s)
         )
+        self._runner.hold(LOCK)
         return Answer(m.Locked(token=token, lease_s=command.lease_s))
 
     async def _renew(self, _: m.RenewLock, asked: _Asked) -> Answer:
@@ -332,6 +338,7 @@ class Commands:
 
     async def _unlock(self, command: m.Unlock, asked: _Asked) -> Answer:
         await asyncio.to_thread(self._manual.unlock, asked.token, force=command.force)
+        self._runner.release(LOCK)
         return Answer(m.Done(message="the rig is free"))
 
     # ------------------------------------------------------------ events

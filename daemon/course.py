@@ -155,8 +155,9 @@ class Course:
             )
         finally:
             if session is not None:
-                if not session.ended.is_set():
-                    self._rig.safe_within(self._rig.make_safe(), SAFE_S)
+                # Whoever revoked the session has sent the devices there already: this waits.
+                futures = self._rig.make_safe(halt=not session.ended.is_set())
+                self._rig.safe_within(futures, SAFE_S)
                 self._rig.leave(session)
         self._close(end)
         return end
@@ -348,6 +349,7 @@ class Course:
             self.folder,
             components,
             full_scale=info.pixel_format.full_scale,
+            pixel_format=info.pixel_format,
             frame=self._viewfinder.picture(),
             truth=truth,
             timings={**self._timings, "rate_hz": self._rate()},

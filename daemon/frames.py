@@ -8,8 +8,9 @@ line was never acknowledged: it is removed when the folder is opened again.
 `frames.zarr` is a plain Zarr v3 array (frame, y, x[, c]) that zarr, dask, xarray and napari open.
 Each frame is one shard and so one file, row bands of about 1 MiB are its inner chunks. They are
 not compressed: a shard is then the frame's bytes followed by an index that is the same for all
-frames, written with one call. (zarr-python's own pipeline took 42 ms for a frame of 2448 x 2048
-16-bit pixels, 55 ms with zstd level 1; this takes 3 ms, and 4 ms for the checksum.) A missing frame
+frames, so that a frame costs a bare write and a checksum. Measured side by side: 0.6 ms at
+1024 x 768 of 8 bits (zarr-python's own pipeline 9 ms, with zstd level 1 12 ms), and at 2448 x 2048
+of 16 bits 36 ms where the bare write took 34 (71 ms, 84 ms). A missing frame
 has no shard, which Zarr reads as zeros.
 """
 

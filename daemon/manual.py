@@ -138,6 +138,11 @@ class Manual:
         self._rig.safe_within(futures, SAFE_S)
         self._on_change()
 
+    def make_way(self) -> None:
+        """Before a scan: end manual work, and wait for the safe state."""
+        if self.active:
+            self.end()
+
     def _end(self) -> list[Future[None]]:
         session, self._session = self._session, None
         if session is None or session.ended.is_set():

@@ -177,7 +177,7 @@ class Rig:
             elif now >= member.next_try:
                 if member.health is Health.READY:
                     if self._session is None:
-                        self._begin(member, CHECK_S, Device.check)
+                        self._begin(member, CHECK_S, lambda d: d.check())
                 elif member.health is not Health.STUCK or not member.thread.stuck:
                     self._begin(member, CONNECT_S, self._connecting(member))
 
@@ -277,7 +277,9 @@ class Rig:
                 member.device.halt()
         # The projector first: light is what a person in front of it notices.
         members = sorted(self._members.values(), key=lambda m: m.device.kind != "projector")
-        return [m.thread.submit(Device.safe, SAFE_S) for m in members if m.identity is not None]
+        return [
+            m.thread.submit(lambda d: d.safe(), SAFE_S) for m in members if m.identity is not None
+        ]
 
     def safe_within(self, futures: list[Future[None]], seconds: float) -> bool:
         """Wait until all are safe; False, with the log saying who is not, after `seconds`."""
@@ -299,7 +301,7 @@ class Rig:
         """Safe state, then let go of every device. For shutdown only."""
         self.safe_within(self.make_safe(), SAFE_S)
         for member in self._members.values():
-            member.thread.submit(Device.close, SAFE_S)
+            member.thread.submit(lambda d: d.close(), SAFE_S)
         for member in self._members.values():
             if not member.thread.close(SAFE_S):
                 log.error("device thread did not end", device=member.device.name)

@@ -41,6 +41,9 @@ _RESUMABLE_CODES = {
     Code.STORAGE_FAILED,
 }
 
+LOCK = "lock"
+"""A reason to hold the queue, except for runs of whoever holds the rig."""
+
 log = structlog.get_logger(__name__)
 
 
@@ -56,17 +59,21 @@ class Runner:
         viewfinder: Viewfinder,
         publish: Callable[[AnyEvent], None],
         on_activity: Callable[[], None],
+        make_way: Callable[[], None],
     ) -> None:
-        """`publish` and `on_activity` must be safe to call from any thread."""
+        """`publish` and `on_activity` must be safe to call from any thread; `make_way` ends manual
+        work before a run and may block."""
         self._rig = rig
         self._store = store
         self._config = config
         self._viewfinder = viewfinder
         self._publish = publish
         self._on_activity = on_activity
+        self._make_way = make_way
         self._course: Course | None = None
         self._wake = asyncio.Event()
         self._held: set[str] = set()
+        self._of_holder: set[str] = set()  # runs submitted by whoever holds the rig
         self._stopping = False
 
     # ------------------------------------------------------------ the loop
@@ -94,9 +101,12 @@ class Runner:
             await self._run(run)
 
     def _next(self) -> RunFolder | None:
-        if self._held or self._stopping:
+        if self._stopping or self._held - {LOCK}:
             return None
-        return next(iter(self._store.queued()), None)
+        waiting = self._store.queued()
+        if LOCK in self._held:
+            waiting = [run for run in waiting if run.id in self._of_holder]
+        return next(iter(waiting), None)
 
     async def _run(self, run: RunFolder) -> None:
         loop = asyncio.get_running_loop()
@@ -117,6 +127,7 @@ class Runner:
 
         self._on_activity()
         log.info("run begins", run=run.id)
+        await asyncio.to_thread(self._make_way)
         thread = threading.Thread(target=execute, name="umbra-sequencer")
         thread.start()
         await ended
@@ -135,12 +146,14 @@ class Runner:
         self._wake.set()
 
     def hold(self, why: str) -> None:
-        """Begin no run for as long as `why` is not released (an e-stop, a lock, manual work)."""
+        """Begin no run for as long as `why` is not released; during a LOCK only its holder's."""
         self._held.add(why)
 
     def release(self, why: str) -> None:
         """The reason to hold is gone."""
         self._held.discard(why)
+        if why == LOCK:
+            self._of_holder.clear()
         self._wake.set()
 
     def end_for_estop(self, by: str) -> None:
@@ -153,22 +166,28 @@ class Runner:
     @property
     def alive(self) -> bool:
         """Whether the run under way, if any, has moved lately (the watchdog's question)."""
-        return self._course is None or self._course.alive
+        return self._active is None or self._active.alive
 
     @property
     def current(self) -> RunFolder | None:
         """The run under way."""
-        return self._course.folder if self._course else None
+        return self._active.folder if self._active else None
+
+    @property
+    def _active(self) -> Course | None:
+        """The course, unless its run has ended and only the loop has not heard of it yet."""
+        course = self._course
+        return None if course is None or course.folder.file.state.ended else course
 
     @property
     def course(self) -> Course | None:
         """The course of the run under way."""
-        return self._course
+        return self._active
 
     @property
     def progress(self) -> Progress | None:
         """How far the run under way is."""
-        return self._course.progress() if self._course else None
+        return self._active.progress() if self._active else None
 
     def queue(self) -> list[RunFolder]:
         """The runs that wait, the next first."""
@@ -178,8 +197,8 @@ class Runner:
         """A run by its id; "" is the current, else the newest. Raises UmbraError(unknown_run)."""
         if run:
             return self._store.open(run)
-        if self._course is not None:
-            return self._course.folder
+        if self._active is not None:
+            return self._active.folder
         newest = next(iter(self._store.runs()), None)
         if newest is None:
             raise UmbraError(Code.UNKNOWN_RUN, "there is no run yet; `umbra scan` makes one")
@@ -187,7 +206,9 @@ class Runner:
 
     # ------------------------------------------------------------ commands
 
-    def submit(self, spec: AnyScan, by: str, request_id: str, *, first: bool) -> RunFolder:
+    def submit(
+        self, spec: AnyScan, by: str, request_id: str, *, first: bool, holder: bool
+    ) -> RunFolder:
         """Queue a scan, durably. Raises UmbraError when the rig cannot do it as it is now.
 
         Safe to repeat with the same `request_id`, also after a restart.
@@ -201,6 +222,8 @@ class Runner:
         run = self._store.create(
             spec, self._rig.snapshot(), by=by, request_id=request_id, first=first
         )
+        if holder:
+            self._of_holder.add(run.id)
         log.info("run queued", run=run.id, by=by)
         self._queue_changed(run)
         return run
@@ -226,13 +249,14 @@ class Runner:
 
     def resume(self, run: str) -> RunFolder:
         """Go on with the paused run, or queue an interrupted one again, ahead of the others."""
-        if not run and self._course is None:
+        course = self._active
+        if not run and course is None:
             raise UmbraError(
                 Code.WRONG_STATE, "no run is paused; name the interrupted one: `umbra resume RUN`"
             )
         folder = self.find(run)
-        if self._course is not None and folder.id == self._course.folder.id:
-            self._course.resumed()
+        if course is not None and folder.id == course.folder.id:
+            course.resumed()
             return folder
         file = folder.file
         broke = file.state is RunState.FAILED and file.end and file.end.code in _RESUMABLE_CODES
@@ -245,7 +269,7 @@ class Runner:
 
     def abort(self, run: str, by: str) -> RunFolder:
         """End a run that waits, runs or is paused; the devices go to their safe state at once."""
-        course = self._course
+        course = self._active
         if course is not None and run in {"", course.folder.id}:
             course.control.end(RunState.ABORTED, "aborted", by=by)
             self._rig.make_safe()
@@ -259,7 +283,7 @@ class Runner:
         return waiting
 
     def _running(self, run: str) -> Course:
-        course = self._course
+        course = self._active
         if course is None or run not in {"", course.folder.id}:
             if run:
                 raise self._wrong_state(self._store.open(run), "paused")

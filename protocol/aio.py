@@ -14,7 +14,7 @@ import weakref
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import zmq
 import zmq.asyncio
@@ -57,7 +57,7 @@ class AsyncClient(Commands):
         self,
         endpoint: str | None = None,
         *,
-        keys: ClientKeys | Path | str | None = None,
+        keys: ClientKeys | Path | str | Literal[False] | None = None,
         timeout_s: float = 5.0,
         name: str = "",
     ) -> None:

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import zmq
 
@@ -50,7 +50,7 @@ log = logging.getLogger("umbra")
 def connect(
     endpoint: str | None = None,
     *,
-    keys: ClientKeys | Path | str | None = None,
+    keys: ClientKeys | Path | str | Literal[False] | None = None,
     timeout_s: float = 5.0,
     name: str = "",
 ) -> Client:
@@ -63,8 +63,12 @@ def connect(
     return Client(endpoint, keys=keys, timeout_s=timeout_s, name=name)
 
 
-def chosen_keys(keys: ClientKeys | Path | str | None, endpoint: str) -> ClientKeys | None:
-    """The keys given, or read from the folder given, or the default ones."""
+def chosen_keys(
+    keys: ClientKeys | Path | str | Literal[False] | None, endpoint: str
+) -> ClientKeys | None:
+    """The keys given, or read from the folder given, or the default ones; False: none at all."""
+    if keys is False:
+        return None
     if isinstance(keys, str | Path):
         return ClientKeys.load(keys)
     return keys or ClientKeys.default(local=is_local(endpoint))
@@ -85,7 +89,7 @@ class Client(Commands):
         self,
         endpoint: str | None = None,
         *,
-        keys: ClientKeys | Path | str | None = None,
+        keys: ClientKeys | Path | str | Literal[False] | None = None,
         timeout_s: float = 5.0,
         name: str = "",
     ) -> None:

@@ -182,11 +182,16 @@ class LockInfo(Fact, frozen=True, kw_only=True):
 class CameraSettings(Fact, frozen=True, kw_only=True):
     """What a camera can be told; None leaves a setting as it is. Names: SFNC's, in snake case."""
 
-    exposure_us: Annotated[float, Meta(gt=0)] | None = None
-    gain: float | None = None
-    pixel_format: str | None = None
-    frame_rate_hz: Annotated[float, Meta(gt=0)] | None = None
-    roi: tuple[int, int, int, int] | None = None  # x, y, width, height
+    exposure_us: Annotated[float, Meta(gt=0, description="exposure of a frame in µs")] | None = None
+    gain: Annotated[float, Meta(description="in the camera's own unit")] | None = None
+    pixel_format: Annotated[str, Meta(description="Mono8, BayerRG12 ...")] | None = None
+    frame_rate_hz: Annotated[float, Meta(gt=0, description="of a free-running camera")] | None = (
+        None
+    )
+    roi: (
+        Annotated[tuple[int, int, int, int], Meta(description="x, y, width, height in pixels")]
+        | None
+    ) = None
 
 
 # ---------------------------------------------------------------- commands

@@ -17,6 +17,7 @@ import numpy as np
 
 from drivers.base import Context
 from drivers.virtual.geometry import F32, Pinhole
+from drivers.virtual.occluder import Occluder
 from drivers.virtual.transport import transport
 
 RENDERED = 24  # planes kept: black, white and the patterns of a short set
@@ -48,12 +49,25 @@ class Source(Protocol):
         ...
 
 
+class Carrier(Protocol):
+    """What moves an occluder through the light."""
+
+    occluder: Occluder
+    shades: str  # the light that it stands under; "": all
+    before_scene_mm: float  # from the middle of the scene to the occluder's plane
+
+    def offset_at(self, at_ns: int) -> tuple[float, float]:
+        """Where the occluder really was, in mm from the middle of its travel."""
+        ...
+
+
 class Bench:
     """The sources of one rig, and the light that they send into a camera."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.sources: dict[str, Source] = {}
+        self.carrier: Carrier | None = None
         self._planes: OrderedDict[Hashable, F32] = OrderedDict()
 
     @classmethod

@@ -30,6 +30,7 @@ class Fault(enum.StrEnum):
     DROP_TRIGGER = "drop-trigger"  # the camera does not hear a trigger
     DUPLICATE_FRAME = "duplicate-frame"  # the camera gives the frame before once more
     INCOMPLETE_FRAME = "incomplete-frame"  # the lower half of a frame is missing
+    NO_SWITCH = "no-switch"  # the stage's homing finds no limit switch
     LATE_FLIP = "late-flip"  # the projector flips one refresh later than it says
 
 
@@ -38,6 +39,7 @@ MAIN_OF = {
     Fault.DUPLICATE_FRAME: "grab",
     Fault.INCOMPLETE_FRAME: "grab",
     Fault.LATE_FLIP: "show",
+    Fault.NO_SWITCH: "home",
 }
 
 

@@ -78,7 +78,7 @@ class Transport:
         full = np.ones((source.height, source.width), np.float32)
         planes = [sum(self.render(self.light(full), k)) for k in "RGB"]
         brightest = np.max(np.stack([np.asarray(p) for p in planes]), axis=0)
-        self._unit = float(np.percentile(brightest[seen.smooth & (seen.gloss == 0)], 99.5))
+        self._unit = float(np.percentile(brightest[seen.smooth], 99.8))
 
     @property
     def correspondence(self) -> tuple[F32, F32]:
@@ -154,7 +154,7 @@ class Transport:
         seen = self.view.seen
         towards = unit(vector(self.source.position) - seen.point)
         halfway = np.maximum(dot(unit(towards + seen.away), seen.normal), 0)
-        return np.asarray(self.view.gloss * 0.2 * halfway**90, np.float32)
+        return np.asarray(self.view.gloss * 0.3 * halfway**90, np.float32)
 
 
 def room(seen: View, layout: str) -> F32:

@@ -169,7 +169,8 @@ def run(arguments: list[str]) -> int:
         if not hasattr(error, "format_message"):  # typer's usage errors have it
             raise
         where = getattr(getattr(error, "ctx", None), "command_path", "umbra")
-        complain(f"{error.format_message().rstrip('.?')}; see {where} --help")
+        said = error.format_message().rstrip(".")
+        complain(f"{said}{' See' if said.endswith('?') else '; see'} {where} --help")
         return Exit.USAGE
     return code if isinstance(code, int) else Exit.OK
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from protocol.run import Run
 
 OUT = Path("umbra-demo")
-VIRTUAL = {kind: {"driver": "virtual"} for kind in ("camera", "projector", "stage")}
+VIRTUAL = {kind: {"driver": "virtual"} for kind in ("camera", "projector")}
 
 
 class Demonstrated(Fetched, frozen=True, kw_only=True):
@@ -35,7 +35,7 @@ class Demonstrated(Fetched, frozen=True, kw_only=True):
 def demo(
     *,
     method: Annotated[
-        str, tag_option(AnyScan, "-m", "--method", help_text="The scan; default checkerboard.")
+        str, tag_option(AnyScan, "-m", "--method", help_text="The scan.")
     ] = "checkerboard",
     out: Annotated[
         Path | None,

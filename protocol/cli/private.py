@@ -7,6 +7,7 @@ pipe from this process, and `umbrad --until-eof` stops when that closes, however
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -44,10 +45,12 @@ def private_daemon(config: Mapping[str, Any]) -> Iterator[Client]:
         file.write_text(toml(whole), encoding="utf-8")
         with (folder / "log").open("wb") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "daemon.app", "--config", str(file), "--until-eof"],
+                # -P: a file in the user's folder must not pass for one of the daemon's modules
+                [sys.executable, "-P", "-m", "daemon.app", "--config", str(file), "--until-eof"],
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=log,
+                env={k: v for k, v in os.environ.items() if k != "NOTIFY_SOCKET"},
                 start_new_session=True,  # Ctrl-C is for us: we stop it in good order
             )
         try:
@@ -76,7 +79,7 @@ def _when_ready(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> C
             code = Code.BAD_INPUT if process.returncode == 2 else Code.UNREACHABLE
             raise UmbraError(code, f"the private daemon did not start: {_last_line(log)}")
         try:
-            return Client(endpoint, timeout_s=0.5)
+            return Client(endpoint, keys=False, timeout_s=0.5)
         except UmbraError as error:
             if error.code is not Code.UNREACHABLE:
                 raise

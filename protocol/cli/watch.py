@@ -50,11 +50,17 @@ def follow(run: Run, *, as_json: bool = False, title: str = "") -> RunInfo:
     if as_json:
         for progress in news:
             print_json(progress, lines=True)
-    elif on_terminal(sys.stderr):
-        _bar(news, title or f"{run.id} {method(run.info)}")
+    else:
+        show_progress(news, title or f"{run.id} {method(run.info)}")
+    return run.info
+
+
+def show_progress(news: Iterable[Progress], title: str) -> None:
+    """Progress on stderr: a bar on a terminal, else lines."""
+    if on_terminal(sys.stderr):
+        _bar(news, title)
     else:
         _lines(news)
-    return run.info
 
 
 def conclude(info: RunInfo, *, quiet: bool = False) -> Exit:

@@ -49,7 +49,7 @@ def ending(run: RunInfo) -> str:
     """Why it ended, if that needs words."""
     if run.end is None:
         return ""
-    by = f" by {run.end.by}" if run.end.by else ""
+    by = f" by {run.end.by}" if run.end.by and run.end.by not in run.end.reason else ""
     return f"{run.end.reason}{by}"
 
 

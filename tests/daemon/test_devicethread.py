@@ -99,7 +99,7 @@ def test_a_call_that_never_comes_back_is_named(
 ) -> None:
     monkeypatch.setattr("daemon.devicethread._HALT_GRACE_S", 0.05)
     lamp.device.deaf = True
-    with pytest.raises(Stuck, match="lamp: call: the driver has not come back in 0.05 s"):
+    with pytest.raises(Stuck, match=r"lamp: call: the driver has not come back in 0.05 s"):
         lamp.call(Lamp.block, 0.05)
     assert lamp.stuck
     assert not lamp.alive

@@ -27,7 +27,6 @@ from protocol.messages import (
     Picture,
     Request,
     Role,
-    Runs,
     Snap,
 )
 
