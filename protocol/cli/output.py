@@ -42,9 +42,8 @@ def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 
         table = Table(box=None, header_style="bold dim", pad_edge=False, padding=(0, 2, 0, 0))
         for i, heading in enumerate(headings):
-            # the first column names things: a name cut short names nothing
-            longest = max((len(row[i]) for row in rows), default=0) if i == 0 else None
-            table.add_column(heading, min_width=longest)
+            # the first column names things: the others give way before a name is cut short
+            table.add_column(heading, no_wrap=i == 0)
         for row in rows:
             table.add_row(*map(coloured, row))
         Console(highlight=False).print(table)

@@ -116,7 +116,7 @@ def test_demo(tmp_path: Path) -> None:
     assert_no_orphan(tmp_path)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [*UMBRA, "demo", "-o", "out"], cwd=tmp_path, stderr=subprocess.PIPE, text=True
@@ -133,6 +133,9 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
         assert code == 130
         assert "nothing was written" in said
         assert "Traceback" not in said
+        assert_no_orphan(tmp_path)
+    elif number is signal.SIGTERM:
+        assert code == 128 + signal.SIGTERM
         assert_no_orphan(tmp_path)
     else:  # its folder cannot be cleared away by the dead; the daemon goes all the same
         assert code == -signal.SIGKILL
