@@ -116,6 +116,12 @@ class Device(ABC):
     def close(self) -> None:
         """Let go of everything; idempotent; does not raise for a device that is gone."""
 
+    @classmethod
+    def discover(cls) -> list[dict[str, Any]]:
+        """What of this driver is attached: `model`, `serial`, and `options` to paste into rig.toml.
+        [] where a driver cannot tell. Raises DeviceError."""
+        return []
+
     def facts(self) -> dict[str, Any]:
         """What people and scripts want to know of it, JSON-able; no I/O."""
         return {}

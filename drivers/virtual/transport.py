@@ -78,7 +78,7 @@ class Transport:
         full = np.ones((source.height, source.width), np.float32)
         planes = [sum(self.render(self.light(full), k)) for k in "RGB"]
         brightest = np.max(np.stack([np.asarray(p) for p in planes]), axis=0)
-        self._unit = float(np.percentile(brightest[seen.smooth], 99.8))
+        self._unit = float(np.percentile(brightest[seen.smooth], 99.5))
 
     @property
     def correspondence(self) -> tuple[F32, F32]:

@@ -122,15 +122,18 @@ def log(
 
 
 def log_line(record: dict[str, Any]) -> str:
-    """A log record as one line: time, level, what happened, and the rest as key=value."""
-    rest = dict(record)
-    time = str(rest.pop("timestamp", rest.pop("ts", "")))
+    """A log record as one line: time, level, what happened, the rest as key=value; a traceback,
+    where there is one, below it."""
+    rest = {name: value for name, value in record.items() if value not in ("", None)}
+    time = str(rest.pop("timestamp", ""))
     level = str(rest.pop("level", "")).upper()
-    event = str(rest.pop("event", rest.pop("message", "")))
+    event = str(rest.pop("event", ""))
+    trace = str(rest.pop("exception", ""))
     if on_terminal() and len(time) > 19:
         time = time[11:23]
     values = " ".join(f"{name}={value}" for name, value in rest.items())
-    return "  ".join(part for part in (time, f"{level:7}", event, values) if part.strip())
+    line = "  ".join(part for part in (time, f"{level:7}", event, values) if part.strip())
+    return "\n    ".join([line, *trace.splitlines()])
 
 
 def stop(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
