@@ -366,6 +366,7 @@ class StageStatus:
     state: StageState
     position_mm: tuple[float, float] | None
     at_ns: int
+    detail: str = ""  # in words: which alarm, what holds it, and the remedy
 
 
 class Stage(Device):
@@ -407,6 +408,18 @@ class Stage(Device):
     @abstractmethod
     def position_at(self, at_ns: int) -> tuple[float, float] | None:
         """Where it was at a moment of the clock, between the positions reported; None: unknown."""
+
+    def stop(self) -> None:
+        """End every motion, endless circles too: decelerate, and drop what is queued. Idempotent.
+
+        Unlike after `hold` there is nothing to resume. The position stays known if the device can
+        prove it. A device that has no better way goes to its safe state.
+        """
+        self.safe()
+
+    def jog(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
+        """Go to a point by hand: as `move`, but `hold` ends it for good where the device can."""
+        self.move(x_mm, y_mm, feed_mm_s)
 
     @abstractmethod
     def hold(self) -> None:

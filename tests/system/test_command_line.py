@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.system.conftest import until
+from tests.system.harness import until
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
@@ -138,7 +138,7 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
         assert code == -signal.SIGKILL
         folders = list((tmp_path / "tmp").glob("umbra-*"))
         for folder in folders:
-            until(lambda folder=folder: not _listens(folder / "command"))  # type: ignore[misc]
+            until(lambda folder=folder: not _listens(folder / "command"))
             shutil.rmtree(folder)
         assert_no_orphan(tmp_path)
     assert not (tmp_path / "out").exists()
