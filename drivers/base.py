@@ -116,6 +116,12 @@ class Device(ABC):
     def close(self) -> None:
         """Let go of everything; idempotent; does not raise for a device that is gone."""
 
+    @classmethod
+    def discover(cls) -> list[dict[str, Any]]:
+        """What of this driver is attached: `model`, `serial`, and `options` to paste into rig.toml.
+        [] where a driver cannot tell. Raises DeviceError."""
+        return []
+
     def facts(self) -> dict[str, Any]:
         """What people and scripts want to know of it, JSON-able; no I/O."""
         return {}
@@ -125,11 +131,12 @@ class Device(ABC):
 
 
 class PixelFormat(enum.StrEnum):
-    """SFNC PixelFormat names that Umbra understands; 10 and 12 bit come unpacked and unshifted."""
+    """SFNC PixelFormat names that Umbra understands; 10 to 14 bit come unpacked and unshifted."""
 
     MONO8 = "Mono8"
     MONO10 = "Mono10"
     MONO12 = "Mono12"
+    MONO14 = "Mono14"
     MONO16 = "Mono16"
     BAYER_RG8 = "BayerRG8"
     BAYER_GR8 = "BayerGR8"
@@ -143,11 +150,18 @@ class PixelFormat(enum.StrEnum):
     BAYER_GR12 = "BayerGR12"
     BAYER_GB12 = "BayerGB12"
     BAYER_BG12 = "BayerBG12"
+    BAYER_RG14 = "BayerRG14"
+    BAYER_GR14 = "BayerGR14"
+    BAYER_GB14 = "BayerGB14"
+    BAYER_BG14 = "BayerBG14"
     BAYER_RG16 = "BayerRG16"
     BAYER_GR16 = "BayerGR16"
     BAYER_GB16 = "BayerGB16"
     BAYER_BG16 = "BayerBG16"
     RGB8 = "RGB8"
+    RGB10 = "RGB10"
+    RGB12 = "RGB12"
+    RGB14 = "RGB14"
     RGB16 = "RGB16"
 
     @property
@@ -352,6 +366,7 @@ class StageStatus:
     state: StageState
     position_mm: tuple[float, float] | None
     at_ns: int
+    detail: str = ""  # in words: which alarm, what holds it, and the remedy
 
 
 class Stage(Device):
@@ -393,6 +408,18 @@ class Stage(Device):
     @abstractmethod
     def position_at(self, at_ns: int) -> tuple[float, float] | None:
         """Where it was at a moment of the clock, between the positions reported; None: unknown."""
+
+    def stop(self) -> None:
+        """End every motion, endless circles too: decelerate, and drop what is queued. Idempotent.
+
+        Unlike after `hold` there is nothing to resume. The position stays known if the device can
+        prove it. A device that has no better way goes to its safe state.
+        """
+        self.safe()
+
+    def jog(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
+        """Go to a point by hand: as `move`, but `hold` ends it for good where the device can."""
+        self.move(x_mm, y_mm, feed_mm_s)
 
     @abstractmethod
     def hold(self) -> None:
