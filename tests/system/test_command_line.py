@@ -141,7 +141,7 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
         assert code == -signal.SIGKILL
         folders = list((tmp_path / "tmp").glob("umbra-*"))
         for folder in folders:
-            until(lambda folder=folder: not _listens(folder / "command"))
+            until(lambda folder=folder: not _listens(folder / "command"))  # type: ignore[misc]
             shutil.rmtree(folder)
         assert_no_orphan(tmp_path)
     assert not (tmp_path / "out").exists()
