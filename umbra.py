@@ -1,7 +1,7 @@
 """The face for notebooks: ``import umbra; rig = umbra.connect()``. Only hands names on."""
 
-from protocol.client import AsyncClient, Client, connect
-
+from protocol.aio import AsyncClient
+from protocol.client import Client, connect
 from protocol.errors import Code, UmbraError
 from protocol.patterns import BLACK, WHITE, Checker, Solid
 from protocol.scans import Checkerboard, Radiometry, Reference, Stick, TwoImage

@@ -116,6 +116,12 @@ class Device(ABC):
     def close(self) -> None:
         """Let go of everything; idempotent; does not raise for a device that is gone."""
 
+    @classmethod
+    def discover(cls) -> list[dict[str, Any]]:
+        """What of this driver is attached: `model`, `serial`, and `options` to paste into rig.toml.
+        [] where a driver cannot tell. Raises DeviceError."""
+        return []
+
     def facts(self) -> dict[str, Any]:
         """What people and scripts want to know of it, JSON-able; no I/O."""
         return {}
@@ -125,11 +131,12 @@ class Device(ABC):
 
 
 class PixelFormat(enum.StrEnum):
-    """SFNC PixelFormat names that Umbra understands; 10 and 12 bit come unpacked and unshifted."""
+    """SFNC PixelFormat names that Umbra understands; 10 to 14 bit come unpacked and unshifted."""
 
     MONO8 = "Mono8"
     MONO10 = "Mono10"
     MONO12 = "Mono12"
+    MONO14 = "Mono14"
     MONO16 = "Mono16"
     BAYER_RG8 = "BayerRG8"
     BAYER_GR8 = "BayerGR8"
@@ -143,11 +150,18 @@ class PixelFormat(enum.StrEnum):
     BAYER_GR12 = "BayerGR12"
     BAYER_GB12 = "BayerGB12"
     BAYER_BG12 = "BayerBG12"
+    BAYER_RG14 = "BayerRG14"
+    BAYER_GR14 = "BayerGR14"
+    BAYER_GB14 = "BayerGB14"
+    BAYER_BG14 = "BayerBG14"
     BAYER_RG16 = "BayerRG16"
     BAYER_GR16 = "BayerGR16"
     BAYER_GB16 = "BayerGB16"
     BAYER_BG16 = "BayerBG16"
     RGB8 = "RGB8"
+    RGB10 = "RGB10"
+    RGB12 = "RGB12"
+    RGB14 = "RGB14"
     RGB16 = "RGB16"
 
     @property

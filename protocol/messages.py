@@ -182,11 +182,16 @@ class LockInfo(Fact, frozen=True, kw_only=True):
 class CameraSettings(Fact, frozen=True, kw_only=True):
     """What a camera can be told; None leaves a setting as it is. Names: SFNC's, in snake case."""
 
-    exposure_us: Annotated[float, Meta(gt=0)] | None = None
-    gain: float | None = None
-    pixel_format: str | None = None
-    frame_rate_hz: Annotated[float, Meta(gt=0)] | None = None
-    roi: tuple[int, int, int, int] | None = None  # x, y, width, height
+    exposure_us: Annotated[float, Meta(gt=0, description="exposure of a frame in µs")] | None = None
+    gain: Annotated[float, Meta(description="in the camera's own unit")] | None = None
+    pixel_format: Annotated[str, Meta(description="Mono8, BayerRG12 ...")] | None = None
+    frame_rate_hz: Annotated[float, Meta(gt=0, description="of a free-running camera")] | None = (
+        None
+    )
+    roi: (
+        Annotated[tuple[int, int, int, int], Meta(description="x, y, width, height in pixels")]
+        | None
+    ) = None
 
 
 # ---------------------------------------------------------------- commands
@@ -490,6 +495,35 @@ AnyReply = (
     | Locked | Done
 )  # fmt: skip
 
+ANSWERS: dict[type[Command], type[Reply]] = {
+    Hello: Welcome,
+    GetStatus: Status,
+    GetDevices: Devices,
+    Submit: Run,
+    GetQueue: Runs,
+    MoveQueued: Runs,
+    Pause: Run,
+    Resume: Run,
+    Abort: Run,
+    EStop: Done,
+    Reset: Done,
+    ListRuns: Runs,
+    GetRun: Run,
+    GetResult: Result,
+    GetProduct: ProductPart,
+    GetLog: Log,
+    GetPreview: Picture,
+    Show: Done,
+    Snap: Picture,
+    SetCamera: Camera,
+    SetLight: Done,
+    Dark: Done,
+    Lock: Locked,
+    RenewLock: Locked,
+    Unlock: Done,
+}
+"""What each command is answered with, unless with an error."""
+
 
 # ---------------------------------------------------------------- events
 
@@ -579,7 +613,7 @@ class Response(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Event(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An event's header. `sequence` counts within the topic and epoch, without gaps."""
+    """An event's header. `sequence` counts from 1 within topic and epoch, without gaps."""
 
     topic: str
     sequence: int

@@ -14,15 +14,19 @@ from msgspec import Meta
 
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 Leak = Annotated[float, Meta(ge=0.0, lt=1.0)]
-LitFraction = Annotated[float, Meta(gt=0.0, le=1.0)]
+LitFraction = Annotated[float, Meta(gt=0.0, le=1.0, description="lit fraction α of the source")]
 Positive = Annotated[float, Meta(gt=0.0)]
+Checker = Annotated[int, Meta(ge=1, le=1024, description="side of a checker in projector pixels")]
 ToneCurve = Annotated[
     str,
     Meta(
         pattern=r"^(linear|srgb|gamma:[0-9]+(\.[0-9]+)?)$",
-        description="linear, srgb, or gamma:2.2 (the exponent that the camera encoded with)",
+        description="tone curve: linear, srgb, or gamma:2.2 (the exponent it was encoded with)",
     ),
 ]
+
+LEAKAGE = "brightness b of an unlit source element as a fraction of a lit one"
+ESTIMATOR = "how frames become components; maxmin is the paper's"
 
 
 class Reference(enum.StrEnum):
@@ -36,10 +40,13 @@ class Reference(enum.StrEnum):
 class Radiometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How camera counts become linear light. ``None`` means: as the rig is calibrated."""
 
-    black: Annotated[float, Meta(ge=0.0)] | None = None  # counts with no light at all
+    black: Annotated[float, Meta(ge=0.0, description="counts with no light at all")] | None = None
     tone: ToneCurve = "linear"  # undone before anything is computed
-    leakage: Leak | None = None  # b
-    saturation: Positive | None = None  # counts from which a sample is called saturated
+    leakage: Annotated[Leak, Meta(description=LEAKAGE)] | None = None
+    saturation: (
+        Annotated[Positive, Meta(description="counts from which a sample is called saturated")]
+        | None
+    ) = None
 
 
 class Scan(
@@ -47,42 +54,48 @@ class Scan(
 ):
     """What every scan can be told, whatever its method."""
 
-    note: str = ""
-    exposure_us: Positive | None = None  # None: as the camera is set
-    gain: float | None = None
+    note: Annotated[str, Meta(description="what the run is for, kept with it")] = ""
+    exposure_us: Annotated[Positive, Meta(description="exposure of a frame in µs")] | None = None
+    gain: Annotated[float, Meta(description="of the camera, in its own unit")] | None = None
     radiometry: Radiometry = Radiometry()
-    #: frames taken before the patterns; None: black and white where the source can show them
-    references: tuple[Reference, ...] | None = None
+    #: None: black and white where the source can show them
+    references: (
+        Annotated[
+            tuple[Reference, ...],
+            Meta(description="frames to take before the patterns"),
+        ]
+        | None
+    ) = None
 
 
 class PatternScan(Scan, frozen=True, kw_only=True):
     """A scan of a fixed set of patterns."""
 
-    average: Count = 1  # frames averaged a pattern (the paper: 32)
-    lit_fraction: LitFraction | None = None  # α; None: the pattern's own
-    estimator: Literal["maxmin"] = "maxmin"
+    average: Annotated[Count, Meta(description="frames averaged a pattern (the paper: 32)")] = 1
+    lit_fraction: LitFraction | None = None  # None: the pattern's own
+    estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
 
 
 class Checkerboard(PatternScan, frozen=True, kw_only=True, tag="checkerboard"):
     """Checkerboard shifts (§4.1): the paper's 25 images are 8 px checkers, 5 x 5 shifts of 3 px."""
 
-    checker: Annotated[int, Meta(ge=1, le=1024)] = 8
-    shift: Annotated[int, Meta(ge=1, le=1024)] = 3
-    shifts: Annotated[int, Meta(ge=2, le=64)] = 5  # in each direction
+    checker: Checker = 8
+    shift: Annotated[int, Meta(ge=1, le=1024, description="step from one to the next, px")] = 3
+    shifts: Annotated[int, Meta(ge=2, le=64, description="shifts in each direction")] = 5
 
 
 class TwoImage(PatternScan, frozen=True, kw_only=True, tag="two-image"):
     """A checkerboard and its complement (§3.3, Eq. 8)."""
 
-    checker: Annotated[int, Meta(ge=1, le=1024)] = 8
+    checker: Checker = 8
 
 
 class Stick(Scan, frozen=True, kw_only=True, tag="stick"):
     """A thin occluder swept over the scene on video (§4.2): α is close to 1, b = 0 in the umbra."""
 
     lit_fraction: LitFraction = 1.0
-    frames: Count | None = None  # None: to the end of the recording
-    estimator: Literal["maxmin"] = "maxmin"
+    frames: Annotated[Count, Meta(description="frames to take")] | None = None  # None: to the end
+    estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
 
 
 AnyScan = Checkerboard | TwoImage | Stick

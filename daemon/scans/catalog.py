@@ -1,0 +1,29 @@
+"""Which method does which scan."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from daemon.scans.checkerboard import CheckerboardMethod
+from daemon.scans.method import Bench, Method, Unsuitable
+from daemon.scans.stick import StickMethod
+from daemon.scans.two_image import TwoImageMethod
+from protocol.scans import AnyScan, Checkerboard, Stick, TwoImage
+
+_METHODS: dict[type[AnyScan], type[Method[Any]]] = {
+    Checkerboard: CheckerboardMethod,
+    TwoImage: TwoImageMethod,
+    Stick: StickMethod,
+}
+
+NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())
+"""The methods' names, as they travel."""
+
+
+def method_for(spec: AnyScan, bench: Bench) -> Method[Any]:
+    """The method of a scan, checked against the rig. Raises Unsuitable."""
+    try:
+        made = _METHODS[type(spec)]
+    except KeyError:
+        raise Unsuitable(f"no method does {type(spec).__name__}") from None
+    return made(spec, bench)
