@@ -1,4 +1,4 @@
-"""A controller that speaks Grbl 1.1 at the byte level, on a pseudo-terminal, for the driver's tests.
+"""A controller that speaks Grbl 1.1, byte by byte, on a pseudo-terminal: for the driver's tests.
 
 Written from Grbl's documented interface, not from the driver. What is real: the 128-byte receive
 buffer that loses what overflows, real-time bytes that bypass it, one ok or error a line, a planner
@@ -287,11 +287,9 @@ class GrblPeer:
                 del self._rx[: end + 1]
                 self.lines.append(line)
                 self._running = self._execute(line)
-            try:
-                next(self._running)
+            if next(self._running, True) is None:
                 return  # it waits for the planner
-            except StopIteration:
-                self._running = None
+            self._running = None
 
     def _answer(self) -> None:
         if self.faults.noise:
@@ -393,24 +391,15 @@ class GrblPeer:
 
     def _gcode(self, line: str, *, jog: bool) -> Iterator[None]:
         words = [(w[0], float(w[1:])) for w in re.findall(r"[A-Z]-?[0-9.]+", line)]
-        if "".join(re.findall(r"[A-Z]-?[0-9.]+", line)) != line:
-            self._say("error:2")
-            return
         codes = {int(v) for c, v in words if c == "G"}
         axes = {c: v for c, v in words if c in "XYIJF"}
-        if codes - {0, 1, 2, 3, 17, 20, 21, 53, 90, 91, 94}:
-            self._say("error:20")
-            return
         self._absolute = True if 90 in codes else False if 91 in codes else self._absolute
         feed = axes.get("F", 0.0) / 60 or self._feed
+        if (error := self._objection(line, codes, axes, feed)) or not {"X", "Y"} & axes.keys():
+            self._say(f"error:{error}") if error else self._ok()
+            return
         if not jog:
             self._feed = feed
-        if not {"X", "Y"} & axes.keys():
-            self._ok()
-            return
-        if not feed:
-            self._say("error:22")
-            return
         x, y = self._parsed
         if 53 in codes or self._absolute:
             work = (
@@ -422,9 +411,6 @@ class GrblPeer:
             target = (x + axes.get("X", 0.0), y + axes.get("Y", 0.0))
         points = [target]
         if {2, 3} & codes:
-            if 53 in codes:
-                self._say("error:30")
-                return
             points = _arc((x, y), target, (axes.get("I", 0.0), axes.get("J", 0.0)), 2 in codes)
         for point in points:
             if self.settings.soft_limits and not self._within(point):
@@ -437,6 +423,16 @@ class GrblPeer:
             if self.state == "Idle" and (jog or len(self._blocks) >= 15):
                 self.state = "Jog" if jog else "Run"
         self._ok()
+
+    @staticmethod
+    def _objection(line: str, codes: set[int], axes: dict[str, float], feed: float) -> int:
+        if "".join(re.findall(r"[A-Z]-?[0-9.]+", line)) != line:
+            return 2
+        if codes - {0, 1, 2, 3, 17, 20, 21, 53, 90, 91, 94}:
+            return 20
+        if 53 in codes and {2, 3} & codes:
+            return 30
+        return 22 if {"X", "Y"} & axes.keys() and not feed else 0
 
     def _within(self, point: tuple[float, float]) -> bool:
         return all(-t - 1e-6 <= p <= 1e-6 for p, t in zip(point, self.settings.travel, strict=True))

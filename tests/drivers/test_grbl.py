@@ -1,4 +1,4 @@
-"""The Grbl driver against a byte-level controller: what goes right, and everything that goes wrong."""
+"""The Grbl driver against a byte-level controller: what goes right, and what goes wrong."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -130,7 +131,7 @@ def test_grblhal_and_fluidnc_are_recognised(tmp_path: Path) -> None:
     ],
 )
 def test_refuses_what_it_cannot_work_with(
-    tmp_path: Path, made: Settings, options: dict[str, object], words: str
+    tmp_path: Path, made: Settings, options: dict[str, Any], words: str
 ) -> None:
     with GrblPeer(tmp_path, resets_on_open=False, settings=made) as peer:
         stage = make(peer, **options)
@@ -143,15 +144,17 @@ def test_refuses_what_it_cannot_work_with(
 def test_nothing_answers(tmp_path: Path) -> None:
     with GrblPeer(tmp_path, resets_on_open=False) as peer:
         peer.faults.mute = True
-        with pytest.raises(DeviceTimeout, match="no answer .* 115200 baud"):
+        with pytest.raises(DeviceTimeout, match=r"no answer .* 115200 baud"):
             make(peer, ScaledClock(10)).connect()
 
 
 def test_something_else_answers(tmp_path: Path) -> None:
     made = Settings(banner="Marlin 2.1 ready")
-    with GrblPeer(tmp_path, boot_s=0.0, settings=made) as peer:
-        with pytest.raises(DeviceGarbled, match="Marlin"):
-            make(peer, ScaledClock(5)).connect()
+    with (
+        GrblPeer(tmp_path, boot_s=0.0, settings=made) as peer,
+        pytest.raises(DeviceGarbled, match="Marlin"),
+    ):
+        make(peer, ScaledClock(5)).connect()
 
 
 def test_there_is_no_port(tmp_path: Path) -> None:
@@ -174,11 +177,12 @@ def test_a_second_opener_is_refused(peer: GrblPeer, stage: GrblStage) -> None:
 
 def test_nothing_moves_before_homing(peer: GrblPeer, stage: GrblStage) -> None:
     sent = list(peer.lines)
-    for motion in (
+    motions: tuple[Callable[[], None], ...] = (
         lambda: stage.move(-5, -5, FEED),
         lambda: stage.circle(CENTRE, 1.5, FEED, 1),
         lambda: stage.jog(-5, -5, FEED),
-    ):
+    )
+    for motion in motions:
         with pytest.raises(DeviceRefused, match="home"):
             motion()
     assert stage.position_at(stage.clock.now_ns()) is None
@@ -212,7 +216,7 @@ def test_a_missing_switch_is_named_with_its_remedy(peer: GrblPeer, stage: GrblSt
 
 def test_homing_has_a_deadline_of_its_own(peer: GrblPeer, stage: GrblStage) -> None:
     peer.faults.homing_s = 60.0
-    with pytest.raises(DeviceTimeout, match="did not end within 0.5 s"):
+    with pytest.raises(DeviceTimeout, match=r"did not end within 0\.5 s"):
         stage.home(0.5)
     assert stage.status().state is StageState.ALARM
     peer.faults.homing_s = 0.1
@@ -253,7 +257,7 @@ def test_homing_here_makes_the_present_place_the_origin(tmp_path: Path) -> None:
         stage.move(3.0, 1.0, FEED)
         pump_until(stage, at_rest)
         assert (peer.x, peer.y) == pytest.approx((10.0, -1.0), abs=0.005)
-        with pytest.raises(DeviceRefused, match="x = 5.1 mm"):
+        with pytest.raises(DeviceRefused, match=r"x = 5\.1 mm"):
             stage.move(5.1, 0.0, FEED)
         stage.close()
 
@@ -515,14 +519,18 @@ def test_a_hard_limit_blocks_until_unlocked_and_loses_the_position(
     assert homed.status().state is StageState.IDLE
 
 
+def beyond(stage: GrblStage) -> None:
+    stage.move(-60.0, -5.0, FEED)
+    pump_until(stage, lambda s: False)
+
+
 def test_the_controllers_own_soft_limit_is_a_named_alarm(tmp_path: Path) -> None:
     with GrblPeer(tmp_path, resets_on_open=False, speed=2) as peer:
         stage = make(peer, travel_mm=[[-100, 0], [-100, 0]])  # more than the controller's 40
         stage.connect()
         stage.home(10.0)
         with pytest.raises(DeviceRefused, match=r"ALARM:2.*\$130"):
-            stage.move(-60.0, -5.0, FEED)
-            pump_until(stage, lambda s: False)
+            beyond(stage)
         stage.home(10.0)
         assert stage.status().state is StageState.IDLE
         stage.close()
