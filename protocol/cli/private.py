@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -54,12 +55,27 @@ def private_daemon(config: Mapping[str, Any]) -> Iterator[Client]:
                 start_new_session=True,  # Ctrl-C is for us: we stop it in good order
             )
         try:
-            with _when_ready(process, command, folder / "log") as client:
+            with _ends_in_order(), _when_ready(process, command, folder / "log") as client:
                 yield client
         finally:
             _stop(process)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _ends_in_order() -> Iterator[None]:
+    """SIGTERM and SIGHUP become SystemExit in here, so that what was started is cleared away."""
+
+    def leave(number: int, _frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = {number: signal.signal(number, leave) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _private_folder() -> Path:

@@ -72,7 +72,9 @@ def devices(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
 
 
 def _device_facts(device: DeviceInfo) -> str:
-    return ", ".join(f"{name} {_short(value)}" for name, value in device.facts.items())
+    """What is true without its value, what is false, empty or unknown not at all."""
+    told = {k: v for k, v in device.facts.items() if v not in (None, "", False)}
+    return ", ".join(k if v is True else f"{k} {_short(v)}" for k, v in told.items())
 
 
 def _short(value: Any) -> str:

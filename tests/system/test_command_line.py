@@ -116,7 +116,7 @@ def test_demo(tmp_path: Path) -> None:
     assert_no_orphan(tmp_path)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [*UMBRA, "demo", "-o", "out"], cwd=tmp_path, stderr=subprocess.PIPE, text=True
@@ -134,11 +134,14 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
         assert "nothing was written" in said
         assert "Traceback" not in said
         assert_no_orphan(tmp_path)
+    elif number is signal.SIGTERM:
+        assert code == 128 + signal.SIGTERM
+        assert_no_orphan(tmp_path)
     else:  # its folder cannot be cleared away by the dead; the daemon goes all the same
         assert code == -signal.SIGKILL
         folders = list((tmp_path / "tmp").glob("umbra-*"))
         for folder in folders:
-            until(lambda folder=folder: not _listens(folder / "command"))
+            until(lambda folder=folder: not _listens(folder / "command"))  # type: ignore[misc]
             shutil.rmtree(folder)
         assert_no_orphan(tmp_path)
     assert not (tmp_path / "out").exists()
