@@ -283,7 +283,8 @@ def _choices() -> Iterator[type[enum.StrEnum]]:
     """The enums that scans and patterns are made of, in the sources' order."""
     for module in (scans, patterns):
         for cls in vars(module).values():
-            if isinstance(cls, enum.EnumType) and cls.__module__ == module.__name__:
+            mine = isinstance(cls, type) and cls.__module__ == module.__name__
+            if mine and issubclass(cls, enum.StrEnum):
                 yield cls
 
 
