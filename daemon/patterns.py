@@ -6,10 +6,12 @@ to the right and downwards.
 
 from __future__ import annotations
 
+from math import tau
+
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.patterns import AnyPattern, Checker, Solid
+from protocol.patterns import AnyPattern, Axis, Checker, RandomPhase, Sinusoid, Solid
 
 LEVELS = 255
 """The level of a fully lit pixel in a rendered pattern."""
@@ -28,6 +30,10 @@ def render(pattern: AnyPattern, width: int, height: int) -> NDArray[np.uint8]:
             columns, rows = _checker_parity(pattern, width, height)
             lit = (rows[:, None] ^ columns[None, :]) == pattern.inverted
             return np.where(lit, np.uint8(LEVELS), np.uint8(0))
+        case Sinusoid():
+            return _quantised(np.sin(sinusoid_phase(pattern, width, height)))
+        case RandomPhase():
+            return _quantised(np.sin(_random_phases(pattern, width, height) + pattern.phase))
 
 
 def lit_fraction(pattern: AnyPattern, width: int, height: int) -> float:
@@ -42,6 +48,30 @@ def lit_fraction(pattern: AnyPattern, width: int, height: int) -> float:
             odd = x * (height - y) + (width - x) * y
             total = width * height
             return (odd if pattern.inverted else total - odd) / total
+        case _:
+            return float(render(pattern, width, height).mean(dtype=np.float64)) / LEVELS
+
+
+def sinusoid_phase(pattern: Sinusoid, width: int, height: int) -> NDArray[np.float64]:
+    """The argument of a sinusoid's sine at each projector pixel, radians: (height, width)."""
+    turn = tau / pattern.period
+    x, y = np.arange(width) * turn, np.arange(height) * turn
+    if pattern.axis is Axis.X:
+        return np.asarray(x[None, :] + pattern.weave * np.sin(y)[:, None] + pattern.phase)
+    return np.asarray(y[:, None] + pattern.weave * np.sin(x)[None, :] + pattern.phase)
+
+
+def _random_phases(pattern: RandomPhase, width: int, height: int) -> NDArray[np.float64]:
+    """φ of each pixel: ½ + ½ sin φ uniform over the patches."""
+    rows, columns = -(-height // pattern.patch), -(-width // pattern.patch)
+    level = np.random.default_rng(pattern.seed).random((rows, columns))
+    patches = np.arcsin(2.0 * level - 1.0)
+    pixels = np.repeat(np.repeat(patches, pattern.patch, axis=0), pattern.patch, axis=1)
+    return np.asarray(pixels[:height, :width])
+
+
+def _quantised(sine: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.asarray(np.rint((0.5 + 0.5 * sine) * LEVELS), dtype=np.uint8)
 
 
 def _checker_parity(

@@ -88,6 +88,7 @@ class GrblStage(Stage):
         self._travelling = False  # from the first line of a motion until it is known to rest
         self._homed = False
         self._homing = False
+        self._halted_by_reset = False
         self._offset: Point = options.origin_mm  # machine position of the stage's origin
         self._info: StageInfo | None = None
         self._identity: Identity | None = None
@@ -196,6 +197,7 @@ class GrblStage(Stage):
 
     def halt(self) -> None:
         """Feed hold; while homing, which ignores it, a reset. See Device."""
+        self._halted_by_reset = self._homing
         self._link.urge(grbl.RESET if self._homing else grbl.HOLD)
 
     def close(self) -> None:
@@ -365,6 +367,7 @@ class GrblStage(Stage):
         link = self._link
         self._position_lost()
         link.alarm = None
+        self._halted_by_reset = False
         self._homing = True
         try:
             link.command("$H", timeout_s, "home")
@@ -380,8 +383,8 @@ class GrblStage(Stage):
                 "check that both axes turn; raise the time, or $25 (seek rate)",
             ) from None
         except DeviceError:
-            if link.interrupted:  # the halt's reset may have come before the `$H`
-                link.urge(grbl.RESET)
+            if link.interrupted and not self._halted_by_reset:
+                link.urge(grbl.RESET)  # the halt came before the `$H`: it has only held
             raise
         finally:
             self._homing = False
@@ -446,6 +449,7 @@ class GrblStage(Stage):
     def _clear_for(self, phase: str) -> None:
         """Bring it to where `$H` and `$X` are heard: nothing queued, no critical alarm."""
         self._abandon()
+        self._link.await_banner(phase)
         if self._link.alarm in {1, 2}:
             self._position_lost()
             self._link.reset(phase)  # it hears nothing else

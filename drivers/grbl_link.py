@@ -142,6 +142,11 @@ class GrblLink:
             "check its power, the cable and the baud rate, and that it is Grbl 1.1",
         )
 
+    def await_banner(self, phase: str) -> None:
+        """After a reset that nobody waited for: it hears nothing before its banner."""
+        if self._awaiting_banner:
+            self.wait(lambda: not self._awaiting_banner, BANNER_S, phase)
+
     def settle_alarm(self, phase: str) -> None:
         """Most alarms end in a banner, which empties all buffers: wait for it where it comes."""
         self.banner = None

@@ -176,7 +176,8 @@ class SerialPort:
         if port is None:
             raise DeviceLost(self.device, "read", "the port is closed")
         try:
-            return bytes(port.read(max(1, port.in_waiting)))
+            first = bytes(port.read(1))
+            return first + bytes(port.read(port.in_waiting)) if first else b""
         except (OSError, TypeError, ValueError) as error:
             # pyserial shows a port that was closed or pulled under a read as any of these
             raise DeviceLost(

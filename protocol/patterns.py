@@ -5,6 +5,7 @@ All lengths are projector pixels. ``x`` grows to the right, ``y`` downwards.
 
 from __future__ import annotations
 
+import enum
 from typing import Annotated
 
 import msgspec
@@ -35,6 +36,36 @@ class Checker(Pattern, frozen=True, kw_only=True, tag="checker"):
     inverted: bool = False
 
 
-AnyPattern = Solid | Checker
+class Axis(enum.StrEnum):
+    """Along which axis a pattern varies: x makes vertical stripes, y horizontal ones."""
+
+    X = "x"
+    Y = "y"
+
+
+class Sinusoid(Pattern, frozen=True, kw_only=True, tag="sinusoid"):
+    """sin(x + sin y) (§4.3): ½ + ½ sin(2π x/period + weave sin(2π y/period) + phase).
+
+    `weave` (radians) gives the pattern high frequencies along the other axis too; 0: plain stripes.
+    """
+
+    period: Annotated[float, Meta(ge=2.0, le=65_536.0)] = 16.0
+    phase: float = 0.0  # radians
+    axis: Axis = Axis.X
+    weave: float = 1.0
+
+
+class RandomPhase(Pattern, frozen=True, kw_only=True, tag="random-phase"):
+    """½ + ½ sin(φ + phase) with φ drawn for each patch of pixels (§4.3).
+
+    The brightness at phase 0 is uniform in 0 to 1 (the paper's), φ in ±π/2.
+    """
+
+    patch: Length = 4
+    phase: float = 0.0  # radians
+    seed: Annotated[int, Meta(ge=0)] = 1
+
+
+AnyPattern = Solid | Checker | Sinusoid | RandomPhase
 BLACK = Solid(level=0.0)
 WHITE = Solid(level=1.0)

@@ -26,8 +26,8 @@ from protocol.scans import AnyScan, Radiometry, Reference
 from protocol.wire import encode
 
 CLIENT = """\
-import json, sys, uuid
-import zmq
+import json, sys, uuid, zmq
+
 
 def ask(command, attempts=3, wait_ms=5000):
     request = {"id": uuid.uuid4().hex, "protocol": 1, "command": command}
@@ -37,12 +37,12 @@ def ask(command, attempts=3, wait_ms=5000):
             header, *buffers = commands.recv_multipart()
             response = json.loads(header)
             if response["id"] == request["id"]:
-                if response.get("error"):
-                    sys.exit(response["error"]["message"])
-                return response["reply"], {
+                return response["reply"] or sys.exit(response["error"]["message"]), {
                     a["name"]: memoryview(b).cast(FORMAT[a["dtype"]], a["shape"])
-                    for a, b in zip(response["arrays"], buffers)}
+                    for a, b in zip(response["arrays"], buffers)
+                }
     sys.exit("no answer: is umbrad running?")
+
 
 FORMAT = {"uint8": "B", "uint16": "H", "float32": "f", "bool": "?"}
 commands, events = (zmq.Context.instance().socket(kind) for kind in (zmq.DEALER, zmq.SUB))

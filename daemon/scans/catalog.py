@@ -6,14 +6,17 @@ from typing import Any
 
 from daemon.scans.checkerboard import CheckerboardMethod
 from daemon.scans.method import Bench, Method, Unsuitable
+from daemon.scans.sinusoid import RandomPhaseMethod, SinusoidMethod
 from daemon.scans.stick import StickMethod
 from daemon.scans.two_image import TwoImageMethod
-from protocol.scans import AnyScan, Checkerboard, Stick, TwoImage
+from protocol.scans import AnyScan, Checkerboard, RandomPhase, Sinusoid, Stick, TwoImage
 
 _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     Checkerboard: CheckerboardMethod,
     TwoImage: TwoImageMethod,
     Stick: StickMethod,
+    Sinusoid: SinusoidMethod,
+    RandomPhase: RandomPhaseMethod,
 }
 
 NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())

@@ -35,6 +35,11 @@ class References:
         mean = self._means.get(lighting)
         return mean.value() if mean else None
 
+    def frames(self, lighting: Lighting) -> int:
+        """How many frames of a kind came."""
+        mean = self._means.get(lighting)
+        return mean.frames if mean else 0
+
     def facts(self, ambient_from: str) -> dict[str, Any]:
         """Which reference frames there were and what ambient light was taken from."""
         frames = {kind.value: mean.frames for kind, mean in self._means.items()}

@@ -21,6 +21,7 @@ from drivers.base import (
     DeviceRefused,
     DeviceTimeout,
     Frame,
+    Identity,
     Options,
     PixelFormat,
 )
@@ -136,6 +137,14 @@ class VirtualCamera(VirtualDevice, Camera):
         if self._acquisition is Acquisition.FREE and self._set.frame_rate_hz:
             return round(max(fastest, NS / self._set.frame_rate_hz))
         return round(fastest)
+
+    def connect(self) -> Identity:
+        """See Device. The scene is built here, where no frame's deadline waits for it."""
+        identity = super().connect()
+        self.bench.prepare(self._o.width, self._o.height)
+        for layout in self._layouts():
+            _room(self._o.width, self._o.height, layout)
+        return identity
 
     def info(self) -> CameraInfo:
         """See Camera."""

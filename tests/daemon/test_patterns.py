@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daemon.patterns import lit_fraction, render
-from protocol.patterns import BLACK, WHITE, Checker, Solid
+from protocol.patterns import BLACK, WHITE, Axis, Checker, RandomPhase, Sinusoid, Solid
 
 checkers = st.builds(
     Checker,
@@ -59,3 +59,43 @@ def test_solid_levels() -> None:
 def test_an_empty_projector_is_refused() -> None:
     with pytest.raises(ValueError, match="0 x 3"):
         render(WHITE, 0, 3)
+
+
+@pytest.mark.parametrize("axis", list(Axis))
+def test_a_sinusoid_is_one_in_time(axis: Axis) -> None:
+    shown = [
+        render(Sinusoid(period=16, phase=k * np.pi / 2, axis=axis), 48, 40).astype(int)
+        for k in range(4)
+    ]
+    assert np.abs(shown[0] + shown[2] - 255).max() <= 1
+    assert np.abs(shown[1] + shown[3] - 255).max() <= 1
+    along = shown[0] if axis is Axis.X else shown[0].T
+    assert np.abs(along[:, 16:] - along[:, :-16]).max() <= 1
+    assert np.abs(along[0] - along[4]).max() > 60  # woven: the other axis varies too
+
+
+def test_plain_stripes_without_a_weave() -> None:
+    image = render(Sinusoid(period=8, weave=0.0), 16, 4)
+    assert (image == image[0]).all()
+    assert image[0, 0] == 128
+
+
+def test_random_phases_are_the_same_in_each_image_of_a_seed() -> None:
+    base = render(RandomPhase(patch=4), 64, 48)
+    assert (base == render(RandomPhase(patch=4), 64, 48)).all()
+    assert (base != render(RandomPhase(patch=4, seed=2), 64, 48)).any()
+    opposite = render(RandomPhase(patch=4, phase=np.pi), 64, 48)
+    assert np.abs(base.astype(int) + opposite - 255).max() <= 1
+    patches = base.reshape(12, 4, 16, 4)
+    assert (patches == patches[:, :1, :, :1]).all()
+
+
+def test_the_brightness_of_random_phases_is_uniform() -> None:
+    levels = render(RandomPhase(patch=1), 256, 256)
+    counts, _ = np.histogram(levels, bins=8, range=(0, 256))
+    assert counts.min() > 0.9 * counts.mean()
+
+
+@pytest.mark.parametrize("pattern", [Sinusoid(), RandomPhase()])
+def test_waves_light_half_of_the_source(pattern: Sinusoid | RandomPhase) -> None:
+    assert lit_fraction(pattern, 320, 240) == pytest.approx(0.5, abs=0.01)

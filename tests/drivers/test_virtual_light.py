@@ -79,6 +79,18 @@ def test_transport_is_linear(operator: Transport) -> None:
         np.testing.assert_allclose(0.3 * first + 0.6 * second, both, atol=2e-5)
 
 
+def test_correspondence_says_which_projector_pixel_lights_a_point(operator: Transport) -> None:
+    x, y = operator.correspondence
+    emission = np.zeros((96, 128), np.float32)
+    emission[:, :64] = 1
+    direct, _ = operator.render(operator.light(emission), "G")
+    reached = operator.reached
+    assert 0.7 < reached.mean() < 1
+    assert (direct[reached & (x < 63)] > 0).all()
+    assert (direct[x > 64] == 0).all()
+    assert (direct[~reached & (x > 1) & (y > 1) & (y < 94)] == 0).all()
+
+
 def test_light_is_never_negative_and_dark_gives_dark(operator: Transport) -> None:
     nothing = np.zeros((96, 128), np.float32)
     assert all(np.all(part == 0) for part in operator.render(operator.light(nothing), "R"))

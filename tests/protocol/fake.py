@@ -50,7 +50,7 @@ class FakeRig:
         self.hold_back = 0  # answers to send only together with the next one's
         self.before: list[Frames] = []  # messages to send ahead of the next answer
         self.mangle: Callable[[Frames], Frames] | None = None  # applied to each answer
-        self.on_request: Callable[[m.Request], None] | None = None
+        self.on_request: Callable[[m.Request], object] | None = None
         self.refuse: dict[str, ErrorInfo] = {}  # by command tag
         self.arrays: dict[str, np.ndarray[Any, Any]] = {
             "direct": np.arange(12, dtype=np.float32).reshape(3, 4),

@@ -93,7 +93,7 @@ def test_every_command_has_help(name: str, capsys: Captured) -> None:
         (["scan", "checkerboard", "--leak", "1"], "--leakage: expected float < 1.0"),
         (["scan", "checkerboard", "--tone", "log"], "--tone: expected tone curve: linear, srgb"),
         (["scan", "checkerboard", "--references", "white,grey"], "'grey' is not one of ambient"),
-        (["scan", "checkerboard", "--estimator", "best"], "'best' is not one of maxmin"),
+        (["scan", "checkerboard", "--estimator", "best"], "'best' is not one of auto, lsq, maxmin"),
         (["camera", "--roi", "1,2"], "--roi: expected array of length 4"),
         (["camera", "--roi", "1,b,3,4"], "--roi: '1,b,3,4' is not a list of numbers"),
         (["snap", "-o", "frame.jpg"], "pictures are PNG files"),

@@ -283,6 +283,21 @@ async def test_a_cancelled_request_leaves_nothing_behind(fake: FakeRig) -> None:
         assert not rig._waiting
 
 
+async def test_closing_ends_the_requests_under_way(fake: FakeRig) -> None:
+    from protocol.aio import AsyncClient
+
+    rig = await AsyncClient(fake.endpoint, timeout_s=30.0).open()
+    fake.drop = 1
+    heard = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    fake.on_request = lambda _: loop.call_soon_threadsafe(heard.set)
+    asking = asyncio.create_task(rig.status())
+    await heard.wait()
+    await rig.close()
+    with pytest.raises(UmbraError, match="closed"):
+        await asking
+
+
 async def test_the_blocking_client_works_where_a_loop_runs(fake: FakeRig) -> None:
     with Client(fake.endpoint) as rig:  # as in a notebook
         assert rig.status().rig == "fake"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -243,6 +245,24 @@ def test_a_restart_of_the_rig_is_followed() -> None:
                 again.change(run.id, state=end.state, end=end)
                 assert next(progress).phase == "umbrad was restarted"
                 assert next(progress, None) is None
+
+
+@pytest.mark.usefixtures("impatient")
+def test_ctrl_c_ends_the_following_and_the_client_goes_on(fake: FakeRig, rig: Client) -> None:
+    run = rig.scan(Checkerboard())
+    progress = run.progress()
+    next(progress)
+    fake.on_request = lambda _: os.kill(os.getpid(), signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        next(progress)
+    fake.on_request = None
+    assert next(progress, None) is None
+    assert [p.state for p in _two(run.progress())] == [RunState.QUEUED]
+
+
+def _two(progress: Iterator[m.Progress]) -> Iterator[m.Progress]:
+    """The first, and then away from it: the stream must be closed behind us."""
+    yield next(progress)
 
 
 def test_events_that_the_snapshot_holds_are_passed_over() -> None:
