@@ -34,6 +34,7 @@ def _own_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     temporary = tmp_path / "tmp"
     temporary.mkdir()
     monkeypatch.setenv("TMPDIR", str(temporary))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))  # of a daemon with no data folder
     monkeypatch.delenv("UMBRA_RIG", raising=False)
 
 
@@ -98,7 +99,8 @@ def daemons(tmp_path: Path) -> list[str]:
 
 
 def assert_no_orphan(tmp_path: Path) -> None:
-    """Neither a process nor a file of a private daemon is left."""
+    """Neither a process nor a file of a private daemon is left, here or in the user's state."""
+    assert not (tmp_path / "state").exists()
     assert not daemons(tmp_path)
     assert not list((tmp_path / "tmp").glob("umbra-*"))
 
