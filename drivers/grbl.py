@@ -81,6 +81,7 @@ class GrblStage(Stage):
         self.options = options
         self._link = GrblLink(SerialPort(name, options.port, options.baud), context.clock)
         self._link.on_report = self._on_report
+        self._link.on_lost = self._position_lost
         self._track = Track()
         self._arcs: deque[Arc] = deque(maxlen=4)  # those of lines that may be under way
         self._pending: deque[Iterator[str]] = deque()  # motions whose lines are not all sent

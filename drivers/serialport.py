@@ -208,6 +208,12 @@ class SerialPort:
             return False
         return True
 
+    def cancel_read(self) -> None:
+        """From any thread: end a `read` under way, where the port can."""
+        cancel = getattr(self._serial, "cancel_read", None)
+        if cancel is not None:
+            cancel()
+
     def close(self) -> None:
         """Let go of the port; idempotent, does not raise for one that is gone."""
         port, self._serial, self.path = self._serial, None, ""
@@ -245,6 +251,7 @@ class LineReader:
     def close(self) -> None:
         """End the thread; the port's owner closes the port afterwards."""
         self._closing.set()
+        self._port.cancel_read()
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=5 * POLL_S)
 

@@ -230,9 +230,9 @@ def test_halt_ends_homing(peer: GrblPeer, stage: GrblStage) -> None:
     with pytest.raises(DeviceError, match="halt"):
         stage.home(120.0)
     timer.join()
+    assert stage.status().state is not StageState.HOMING
     assert peer.state != "Home"
     peer.faults.homing_s = 0.1
-    assert stage.status().state is StageState.ALARM
     stage.home(10.0)
 
 
@@ -558,6 +558,7 @@ def test_pulled_and_back_under_another_name(peer: GrblPeer, homed: GrblStage) ->
     peer.unplug()
     with pytest.raises(DeviceLost):
         pump_until(homed, lambda s: False)
+    assert homed.position_at(homed.clock.now_ns()) is None
     homed.halt()
     with pytest.raises(DeviceLost):
         homed.connect()

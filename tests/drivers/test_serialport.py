@@ -202,7 +202,7 @@ def test_lines_carry_the_time_of_their_first_byte(ptys: list[Pty]) -> None:
     time.sleep(0.05)
     between = clock.now_ns()
     os.write(ptys[0].master, b"le>\r\n\xff\xfe\r\nok\n" + b"x" * (LONGEST_LINE + 10))
-    lines = []
+    lines: list[tuple[int, str]] = []
     while len(lines) < 4:
         arrived.wait(5)
         arrived.clear()

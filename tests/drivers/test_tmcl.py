@@ -233,8 +233,8 @@ def test_damaged_and_dropped_answers_are_asked_for_again(peer: TmclPeer, homed: 
     for fault in ("drop", "damage"):
         setattr(peer.faults, fault, 2)
         assert homed.status().state is StageState.IDLE
-    peer.faults.before = [rng.randbytes(rng.randrange(1, 30)) for _ in range(30)]
-    for _ in range(15):
+    peer.faults.before = [rng.randbytes(rng.randrange(1, 30)) for _ in range(16)]
+    for _ in range(8):
         assert homed.status().position_mm == pytest.approx(point(0.0), abs=1e-6)
     peer.faults.damage = 1000
     with pytest.raises(DeviceGarbled, match="damaged"):
