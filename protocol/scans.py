@@ -134,4 +134,39 @@ class RandomPhase(PatternScan, frozen=True, kw_only=True, tag="random-phase"):
     seed: Seed = 1
 
 
-AnyScan = Checkerboard | TwoImage | Stick | Sinusoid | RandomPhase
+class GrayCode(PatternScan, frozen=True, kw_only=True, tag="gray-code"):
+    """Gray code and its inverses (§4.3): direct and global from the finest stripes that each pixel
+    resolves, and the projector coordinate of each pixel. The coarsest bit comes first."""
+
+    axes: Annotated[
+        tuple[Axis, ...], Meta(min_length=1, max_length=2, description="coded axes: x, y or x,y")
+    ] = (Axis.X,)
+    bits: (
+        Annotated[int, Meta(ge=1, le=16, description="bits an axis (a recording's must be told)")]
+        | None
+    ) = None  # None: as many as the projector's size takes
+
+
+class RandomBinary(PatternScan, frozen=True, kw_only=True, tag="random-binary"):
+    """Random binary patterns in which each patch is lit equally often (§3.5)."""
+
+    patch: Patch = 6
+    patterns: Annotated[int, Meta(ge=2, le=1000, description="images")] = 20
+    seed: Seed = 1
+
+
+class SingleImage(PatternScan, frozen=True, kw_only=True, tag="single-image"):
+    """One image under fine stripes (§4.4): the peaks and valleys in a window across the stripes are
+    interpolated, and averaged over squares: components at 1/reduce of the camera's resolution."""
+
+    stripe: Annotated[int, Meta(ge=1, le=1024, description="width of a stripe, px")] = 2
+    axis: Annotated[Axis, Meta(description=AXIS)] = Axis.X
+    window: Annotated[int, Meta(ge=3, le=1001, description="n, camera px across stripes")] = 11
+    along: Annotated[int, Meta(ge=1, le=1001, description="m, camera px along stripes")] = 1
+    reduce: Annotated[int, Meta(ge=1, le=64, description="k, camera px averaged each way")] = 4
+    repeat: Annotated[Count, Meta(description="images, one after the other; live: many")] = 1
+
+
+AnyScan = (
+    Checkerboard | TwoImage | Stick | Sinusoid | RandomPhase | GrayCode | RandomBinary | SingleImage
+)

@@ -107,7 +107,9 @@ class LeastSquares:
             "lit_fraction": 0.5,
             "leakage": self._leakage,
             "noise_from": self._noise.source,
-            **self._references.facts(self._ambient_source()),
+            **self._references.facts(
+                self._references.total(ready[0].solve()[0], self._leakage).source
+            ),
             **ratio,
             "advice": _advice(ratio),
         }
@@ -147,43 +149,12 @@ class LeastSquares:
             power = np.maximum(power - np.float32(wave_var) * sigma * sigma, 0)
         amplitude: Plane = np.sqrt(power)
         direct: Plane = amplitude * np.float32(2.0 / (1.0 - b))
-        total, total_weight = self._total(mean)
-        indirect: Plane = total - direct
+        total = self._references.total(mean, b)
+        indirect: Plane = total.light - direct
         variance = sigma * sigma
         direct_var: Plane = variance * np.float32(wave_var * (2.0 / (1.0 - b)) ** 2)
-        total_var: Plane = variance * np.float32(mean_var * total_weight**2)
-        for kind, weight in self._reference_weights(total_weight):
-            at = self._references.mean(kind)
-            if at is not None:
-                one = self._response.deviation(noise, self._response.counts(at))
-                frames = self._references.frames(kind)
-                total_var += one * one * np.float32(weight**2 / frames)
+        total_var: Plane = variance * np.float32(mean_var * total.of_half + total.of_frame)
         return direct, indirect, direct_var, direct_var + total_var
-
-    def _total(self, mean: Plane) -> tuple[Plane, float]:
-        """L_d + L_g from the mean, and what a change of the mean changes in it.
-
-        With a source-off frame 2(M - A)/(1 + b); with a black frame, which holds its leakage,
-        2(M - K)/(1 - b); else 2M/(1 + b).
-        """
-        off = self._references.mean(Lighting.AMBIENT)
-        black = self._references.mean(Lighting.BLACK)
-        if off is None and black is not None:
-            weight = 2.0 / (1.0 - self._leakage)
-            return (mean - black) * np.float32(weight), weight
-        weight = 2.0 / (1.0 + self._leakage)
-        return (mean if off is None else mean - off) * np.float32(weight), weight
-
-    def _reference_weights(self, weight: float) -> list[tuple[Lighting, float]]:
-        source = self._ambient_source()
-        if source == "none":
-            return []
-        return [(Lighting.AMBIENT if source == "ambient frame" else Lighting.BLACK, weight)]
-
-    def _ambient_source(self) -> str:
-        if self._references.frames(Lighting.AMBIENT):
-            return "ambient frame"
-        return "black frame" if self._references.frames(Lighting.BLACK) else "none"
 
     def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
         mean, _, _ = fit.solve()
