@@ -4,9 +4,37 @@ from protocol.aio import AsyncClient
 from protocol.client import Client, connect
 from protocol.errors import Code, UmbraError
 from protocol.patterns import BLACK, WHITE, Checker, Solid
-from protocol.scans import Checkerboard, Radiometry, Reference, Stick, TwoImage
+from protocol.scans import (
+    Checkerboard,
+    GrayCode,
+    Radiometry,
+    RandomBinary,
+    RandomPhase,
+    Reference,
+    SingleImage,
+    Sinusoid,
+    Stick,
+    TwoImage,
+)
 
 __all__ = [
-    "BLACK", "WHITE", "AsyncClient", "Checker", "Checkerboard", "Client", "Code", "Radiometry",
-    "Reference", "Solid", "Stick", "TwoImage", "UmbraError", "connect",
+    "BLACK",
+    "WHITE",
+    "AsyncClient",
+    "Checker",
+    "Checkerboard",
+    "Client",
+    "Code",
+    "GrayCode",
+    "Radiometry",
+    "RandomBinary",
+    "RandomPhase",
+    "Reference",
+    "SingleImage",
+    "Sinusoid",
+    "Solid",
+    "Stick",
+    "TwoImage",
+    "UmbraError",
+    "connect",
 ]  # fmt: skip

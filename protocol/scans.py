@@ -12,6 +12,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from protocol.patterns import Axis
+
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 Leak = Annotated[float, Meta(ge=0.0, lt=1.0)]
 LitFraction = Annotated[float, Meta(gt=0.0, le=1.0, description="lit fraction α of the source")]
@@ -25,8 +27,14 @@ ToneCurve = Annotated[
     ),
 ]
 
+Period = Annotated[float, Meta(ge=2.0, le=65_536.0)]  # projector pixels
+Phases = Annotated[int, Meta(ge=3, le=1000, description="phases of each period, a whole turn")]
+Patch = Annotated[int, Meta(ge=1, le=1024, description="side of a patch in projector pixels")]
+Seed = Annotated[int, Meta(ge=0, le=2**53, description="of the random numbers")]
+
+AXIS = "axis along which the pattern varies: x makes vertical stripes"
 LEAKAGE = "brightness b of an unlit source element as a fraction of a lit one"
-ESTIMATOR = "how frames become components; maxmin is the paper's"
+ESTIMATOR = "how frames become components; maxmin is the paper's, auto the best for the method"
 
 
 class Reference(enum.StrEnum):
@@ -73,7 +81,9 @@ class PatternScan(Scan, frozen=True, kw_only=True):
 
     average: Annotated[Count, Meta(description="frames averaged a pattern (the paper: 32)")] = 1
     lit_fraction: LitFraction | None = None  # None: the pattern's own
-    estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
+    estimator: Annotated[Literal["auto", "maxmin", "topk", "lsq"], Meta(description=ESTIMATOR)] = (
+        "auto"
+    )
 
 
 class Checkerboard(PatternScan, frozen=True, kw_only=True, tag="checkerboard"):
@@ -98,4 +108,65 @@ class Stick(Scan, frozen=True, kw_only=True, tag="stick"):
     estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
 
 
-AnyScan = Checkerboard | TwoImage | Stick
+class Sinusoid(PatternScan, frozen=True, kw_only=True, tag="sinusoid"):
+    """sin(x + sin y) shifted along x (§4.3): N >= 3 phases of each period.
+
+    Several periods give as many independent separations, which are averaged and compared, and
+    (with no weave) an absolute projector coordinate. Frames come period by period.
+    """
+
+    periods: Annotated[
+        tuple[Period, ...],
+        Meta(min_length=1, max_length=16, description="periods in projector pixels"),
+    ] = (16.0,)
+    phases: Phases = 3
+    axis: Annotated[Axis, Meta(description=AXIS)] = Axis.X
+    weave: Annotated[
+        float, Meta(description="phase swing along the other axis, radians; 0: plain stripes")
+    ] = 1.0
+
+
+class RandomPhase(PatternScan, frozen=True, kw_only=True, tag="random-phase"):
+    """Each patch of projector pixels a sinusoid in time with a phase of its own (§4.3)."""
+
+    patch: Patch = 4
+    phases: Phases = 3
+    seed: Seed = 1
+
+
+class GrayCode(PatternScan, frozen=True, kw_only=True, tag="gray-code"):
+    """Gray code and its inverses (§4.3): direct and global from the finest stripes that each pixel
+    resolves, and the projector coordinate of each pixel. The coarsest bit comes first."""
+
+    axes: Annotated[
+        tuple[Axis, ...], Meta(min_length=1, max_length=2, description="coded axes: x, y or x,y")
+    ] = (Axis.X,)
+    bits: (
+        Annotated[int, Meta(ge=1, le=16, description="bits an axis (a recording's must be told)")]
+        | None
+    ) = None  # None: as many as the projector's size takes
+
+
+class RandomBinary(PatternScan, frozen=True, kw_only=True, tag="random-binary"):
+    """Random binary patterns in which each patch is lit equally often (§3.5)."""
+
+    patch: Patch = 6
+    patterns: Annotated[int, Meta(ge=2, le=1000, description="images")] = 20
+    seed: Seed = 1
+
+
+class SingleImage(PatternScan, frozen=True, kw_only=True, tag="single-image"):
+    """One image under fine stripes (§4.4): the peaks and valleys in a window across the stripes are
+    interpolated, and averaged over squares: components at 1/reduce of the camera's resolution."""
+
+    stripe: Annotated[int, Meta(ge=1, le=1024, description="width of a stripe, px")] = 2
+    axis: Annotated[Axis, Meta(description=AXIS)] = Axis.X
+    window: Annotated[int, Meta(ge=3, le=1001, description="n, camera px across stripes")] = 11
+    along: Annotated[int, Meta(ge=1, le=1001, description="m, camera px along stripes")] = 1
+    reduce: Annotated[int, Meta(ge=1, le=64, description="k, camera px averaged each way")] = 4
+    repeat: Annotated[Count, Meta(description="images, one after the other; live: many")] = 1
+
+
+AnyScan = (
+    Checkerboard | TwoImage | Stick | Sinusoid | RandomPhase | GrayCode | RandomBinary | SingleImage
+)

@@ -5,15 +5,34 @@ from __future__ import annotations
 from typing import Any
 
 from daemon.scans.checkerboard import CheckerboardMethod
+from daemon.scans.gray_code import GrayCodeMethod
 from daemon.scans.method import Bench, Method, Unsuitable
+from daemon.scans.random_binary import RandomBinaryMethod
+from daemon.scans.single_image import SingleImageMethod
+from daemon.scans.sinusoid import RandomPhaseMethod, SinusoidMethod
 from daemon.scans.stick import StickMethod
 from daemon.scans.two_image import TwoImageMethod
-from protocol.scans import AnyScan, Checkerboard, Stick, TwoImage
+from protocol.scans import (
+    AnyScan,
+    Checkerboard,
+    GrayCode,
+    RandomBinary,
+    RandomPhase,
+    SingleImage,
+    Sinusoid,
+    Stick,
+    TwoImage,
+)
 
 _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     Checkerboard: CheckerboardMethod,
     TwoImage: TwoImageMethod,
     Stick: StickMethod,
+    Sinusoid: SinusoidMethod,
+    RandomPhase: RandomPhaseMethod,
+    GrayCode: GrayCodeMethod,
+    RandomBinary: RandomBinaryMethod,
+    SingleImage: SingleImageMethod,
 }
 
 NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())

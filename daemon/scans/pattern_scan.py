@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 from daemon import patterns
 from daemon.scans.method import Bench, Expose, Method, Step, Taken, Unsuitable
@@ -51,11 +51,20 @@ def leakage_of(radiometry: Radiometry, bench: Bench) -> float:
 class PatternMethod(Method[P]):
     """References first, then each pattern once, `average` frames each.
 
+    `estimators` are those that a method has; the first is what auto chooses.
+
     On a recording a reference is one image, and only those named in the spec are there.
     """
 
+    estimators: ClassVar[tuple[str, ...]] = ("maxmin",)
+
     def __init__(self, spec: P, bench: Bench, pattern_set: Sequence[AnyPattern]) -> None:
         super().__init__(spec, bench)
+        if spec.estimator not in {"auto", *self.estimators}:
+            raise Unsuitable(
+                f"{self.name} has no estimator {spec.estimator}: {', '.join(self.estimators)}",
+                "$.estimator",
+            )
         self.response = response_of(spec.radiometry, bench)
         self.leakage = leakage_of(spec.radiometry, bench)
         self._plan = (*self._references(), *self._exposures(pattern_set))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import finish
+from daemon.separation.finish import Judgement, finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
@@ -65,9 +65,8 @@ class ComplementPair:
             indirect,
             response=self._response,
             brightest=brightest,
-            deviation=self._noise.deviation(brightest),
             saturated=self._saturated,
-            samples=2,
+            judgement=Judgement.of_extremes(self._noise.deviation(brightest), 2),
             facts={
                 "estimator": "complement pair",
                 "patterns": 2,
