@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from daemon import __version__, picture, products
+from daemon import __version__, discovery, picture, products
 from daemon.config import RigConfig
 from daemon.logs import LogBook
 from daemon.manual import Manual
@@ -62,6 +62,7 @@ class Commands:
             m.Hello: self._hello,
             m.GetStatus: self._status,
             m.GetDevices: self._devices,
+            m.Discover: self._discover,
             m.Submit: self._submit,
             m.GetQueue: self._queue,
             m.MoveQueued: self._move,
@@ -148,6 +149,14 @@ class Commands:
 
     async def _devices(self, _: m.GetDevices, __: _Asked) -> Answer:
         return Answer(m.Devices(devices=self._rig.devices()))
+
+    async def _discover(self, command: m.Discover, asked: _Asked) -> Answer:
+        self._manual.admit(asked.token)
+        self._require_no_run()
+        searches = await discovery.discover(
+            command.drivers, command.timeout_s, self._config.devices, self._rig.devices()
+        )
+        return Answer(m.Discovered(searches=searches))
 
     async def _log(self, command: m.GetLog, _: _Asked) -> Answer:
         return Answer(m.Log(records=self._book.records(command.run, command.limit)))

@@ -110,6 +110,15 @@ class Commands:
         return Ask(m.GetDevices(), lambda a: expect(a.reply, m.Devices).devices)
 
     @command
+    def discover(self, *drivers: str, timeout_s: float = 15.0) -> Ask[tuple[m.Search, ...]]:
+        """What is attached, asked of the drivers named, or of all. They broadcast on networks."""
+        return Ask(
+            m.Discover(drivers=drivers, timeout_s=timeout_s),
+            lambda a: expect(a.reply, m.Discovered).searches,
+            timeout_s + SLOW_S,
+        )
+
+    @command
     def submit(self, spec: AnyScan, *, first: bool = False) -> Ask[RunInfo]:
         """Queue a scan, ahead of the others if `first`; comes back at once. `scan` gives a Run."""
         return Ask(m.Submit(spec=spec, by=self.name, first=first), run_of)

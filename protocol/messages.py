@@ -209,6 +209,24 @@ class CameraSettings(Fact, frozen=True, kw_only=True):
     ) = None
 
 
+class Found(Fact, frozen=True, kw_only=True):
+    """A device that is attached."""
+
+    model: str
+    serial: str
+    toml: str  # to paste into rig.toml
+    used_by: str = ""  # the rig's device that is this one already
+
+
+class Search(Fact, frozen=True, kw_only=True):
+    """What one driver found, or why it could not look."""
+
+    kind: str
+    driver: str
+    found: tuple[Found, ...] = ()
+    problem: str = ""  # with the remedy
+
+
 # ---------------------------------------------------------------- commands
 
 
@@ -230,6 +248,18 @@ class GetStatus(Command, frozen=True, kw_only=True, tag="status"):
 
 class GetDevices(Command, frozen=True, kw_only=True, tag="devices"):
     """The devices in detail."""
+
+
+class Discover(Command, frozen=True, kw_only=True, tag="discover"):
+    """What is attached, driver by driver. Refused while a run uses the devices.
+
+    Vendors' libraries look for cameras by broadcasts on every network, so this happens only when
+    it is asked for, and by the drivers that are named, or else installed.
+    """
+
+    role: ClassVar[Role] = Role.OPERATOR
+    drivers: tuple[str, ...] = ()  # none named: every one that is installed
+    timeout_s: Annotated[float, Meta(gt=0, le=120)] = 15.0  # for each; they look side by side
 
 
 class Submit(Command, frozen=True, kw_only=True, tag="submit"):
@@ -442,9 +472,9 @@ class Unlock(Command, frozen=True, kw_only=True, tag="unlock"):
 
 
 AnyCommand = (
-    Hello | GetStatus | GetDevices | Submit | GetQueue | MoveQueued | Pause | Resume | Abort
-    | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct | GetLog | GetPreview | Show
-    | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove | StageCircle
+    Hello | GetStatus | GetDevices | Discover | Submit | GetQueue | MoveQueued | Pause | Resume
+    | Abort | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct | GetLog | GetPreview
+    | Show | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove | StageCircle
     | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
 )  # fmt: skip
 
@@ -490,6 +520,12 @@ class Devices(Reply, frozen=True, kw_only=True, tag="devices"):
     """Answer to `devices`."""
 
     devices: tuple[DeviceInfo, ...]
+
+
+class Discovered(Reply, frozen=True, kw_only=True, tag="discovered"):
+    """Answer to `discover`."""
+
+    searches: tuple[Search, ...]
 
 
 class Run(Reply, frozen=True, kw_only=True, tag="run"):
@@ -562,14 +598,15 @@ class Done(Reply, frozen=True, kw_only=True, tag="done"):
 
 
 AnyReply = (
-    Welcome | Status | Devices | Run | Runs | Result | ProductPart | Log | Picture | Camera
-    | StageStatus | Locked | Done
+    Welcome | Status | Devices | Discovered | Run | Runs | Result | ProductPart | Log | Picture
+    | Camera | StageStatus | Locked | Done
 )  # fmt: skip
 
 ANSWERS: dict[type[Command], type[Reply]] = {
     Hello: Welcome,
     GetStatus: Status,
     GetDevices: Devices,
+    Discover: Discovered,
     Submit: Run,
     GetQueue: Runs,
     MoveQueued: Runs,
