@@ -32,7 +32,7 @@ pytestmark = pytest.mark.timeout(20)
 
 R = 3.0
 TURN = 200 << 8
-FEED = 15.0
+FEED = 45.0
 
 
 @pytest.fixture
@@ -209,7 +209,7 @@ def test_the_counters_overflow_does_not_move_the_stage(peer: TmclPeer, homed: Tm
 
 
 def test_hold_and_resume(peer: TmclPeer, homed: TmclStage) -> None:
-    homed.circle((10.0, 5.0), R, 30.0, 1)
+    homed.circle((10.0, 5.0), R, 45.0, 1)
     pump_until(homed, lambda s: peer.position > 1000)
     homed.hold()
     assert homed.status().state is StageState.HELD
