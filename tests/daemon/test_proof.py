@@ -30,7 +30,8 @@ class Scene:
     def frame(self, shown: AnyPattern) -> Pixels:
         light = render(shown, W, H) / 255
         counts = AMBIENT + self.albedo * (self.direct * light + GLOBAL * light.mean())
-        return (counts + self.rng.normal(0, SIGMA, counts.shape)).astype(np.uint16)
+        noisy: Pixels = (counts + self.rng.normal(0, SIGMA, counts.shape)).astype(np.uint16)
+        return noisy
 
 
 def step(pattern: AnyPattern, lighting: Lighting = Lighting.PATTERN) -> Expose:
