@@ -35,6 +35,9 @@ format: $(VENV)/.dev  ## let ruff sort imports and lay out the code
 bench: $(VENV)/.dev  ## the promises as ratios: a table, and bench.json
 	$(BIN)/python -m tests.benchmarks $(ARGS)
 
+extra-%: $(VENV)/.dev
+	$(call install,.[$*])
+
 clean:  ## remove all that the other targets made
 	rm -rf $(VENV) demo-out bench.json build dist *.egg-info
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -47,8 +47,8 @@ def check_exposure(endpoints: tuple[str, ...], keys: str) -> None:
         if not is_local(endpoint) and not keys:
             raise ConfigError(
                 f"network: {endpoint} can be reached by anyone on the network: make keys "
-                "(`umbra keys new --server`) and name their folder in network.keys, or bind "
-                "tcp://127.0.0.1"
+                "(`umbra keys new server --into DIR`) and name their folder in network.keys, "
+                "or bind tcp://127.0.0.1"
             )
 
 

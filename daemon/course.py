@@ -349,6 +349,7 @@ class Course:
             self.folder,
             components,
             full_scale=info.pixel_format.full_scale,
+            pixel_format=info.pixel_format,
             frame=self._viewfinder.picture(),
             truth=truth,
             timings={**self._timings, "rate_hz": self._rate()},

@@ -17,6 +17,12 @@ from pathlib import Path
 from protocol.errors import Code, UmbraError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
+_REMEDIES = {
+    errno.EACCES: "let the daemon's user write there, or give it another data folder",
+    errno.EPERM: "let the daemon's user write there, or give it another data folder",
+    errno.EROFS: "mount it for writing, or give the daemon another data folder",
+    errno.EMFILE: "raise the limit of open files",
+}
 
 
 class StorageError(UmbraError):
@@ -45,8 +51,9 @@ def storage(phase: str) -> Iterator[None]:
             raise StorageError(
                 Code.STORAGE_FULL, f"{phase}: the disk is full{place}; delete old runs, then resume"
             ) from error
+        remedy = _REMEDIES.get(error.errno or 0, "check the disk")
         raise StorageError(
-            Code.STORAGE_FAILED, f"{phase}: {error.strerror or error}{place}; check the disk"
+            Code.STORAGE_FAILED, f"{phase}: {error.strerror or error}{place}; {remedy}"
         ) from error
 
 

@@ -157,7 +157,7 @@ def _viewer(subject: Subject) -> str:
     tabs = "".join(f'<label for="v-{name}">{title}</label>' for name, title in views.items())
     figures = "".join(
         f'<figure class="{name}">'
-        f'<img src="{_data_uri(name, subject.pictures[name])}" alt="{name}: {_TITLES[name]}">'
+        f'<img src="{_data_uri(subject.pictures[name])}" alt="{name}: {_TITLES[name]}">'
         f"<figcaption><b>{name.capitalize()}</b><span>{_TITLES[name]}</span>"
         f"{_key(subject.facts) if name == 'quality' else ''}</figcaption></figure>"
         for name in shown
@@ -393,16 +393,11 @@ def _ranges(numbers: Sequence[int]) -> str:
     return ", ".join(shown) + (" …" if len(runs) > 12 else "")
 
 
-def _data_uri(name: str, picture: Picture) -> str:
-    """JPEG for photographs; PNG for the overlay, whose flat colours JPEG would smear."""
-    bgr = np.ascontiguousarray(picture[..., ::-1])
-    if name == "quality":
-        done, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-        kind = "png"
-    else:
-        sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-        done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 92, *sampling])
-        kind = "jpeg"
+def _data_uri(picture: Picture) -> str:
+    """JPEG with colour at full resolution: the overlay's lone coloured pixels must not fade."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, 92]
+    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    done, data = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), options)
     if not done:
-        raise ValueError(f"the picture of {name} cannot be encoded")
-    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+        raise ValueError(f"a picture of {picture.shape} cannot be encoded")
+    return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"

@@ -116,6 +116,12 @@ class Device(ABC):
     def close(self) -> None:
         """Let go of everything; idempotent; does not raise for a device that is gone."""
 
+    @classmethod
+    def discover(cls) -> list[dict[str, Any]]:
+        """What of this driver is attached: `model`, `serial`, and `options` to paste into rig.toml.
+        [] where a driver cannot tell. Raises DeviceError."""
+        return []
+
     def facts(self) -> dict[str, Any]:
         """What people and scripts want to know of it, JSON-able; no I/O."""
         return {}
@@ -360,6 +366,7 @@ class StageStatus:
     state: StageState
     position_mm: tuple[float, float] | None
     at_ns: int
+    detail: str = ""  # in words: which alarm, what holds it, and the remedy
 
 
 class Stage(Device):
@@ -401,6 +408,18 @@ class Stage(Device):
     @abstractmethod
     def position_at(self, at_ns: int) -> tuple[float, float] | None:
         """Where it was at a moment of the clock, between the positions reported; None: unknown."""
+
+    def stop(self) -> None:
+        """End every motion, endless circles too: decelerate, and drop what is queued. Idempotent.
+
+        Unlike after `hold` there is nothing to resume. The position stays known if the device can
+        prove it. A device that has no better way goes to its safe state.
+        """
+        self.safe()
+
+    def jog(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
+        """Go to a point by hand: as `move`, but `hold` ends it for good where the device can."""
+        self.move(x_mm, y_mm, feed_mm_s)
 
     @abstractmethod
     def hold(self) -> None:

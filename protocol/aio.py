@@ -156,15 +156,15 @@ class AsyncClient(Commands):
     async def download(self, run: str, name: str, to: Path | str) -> Path:
         """Fetch a product's file to a path, or into a folder; the file appears when it is whole."""
         part = await self.product_part(run, name)
-        path = place_for(to, part.product)
+        path, size = place_for(to, part.product), part.size
         with arrival(path) as file:
             while True:
                 await asyncio.to_thread(file.write, part.data)
                 done = part.offset + len(part.data)
-                if done >= part.size or not part.data:
+                if done >= size or not part.data:
                     break
                 part = await self.product_part(run, name, offset=done)
-            await asyncio.to_thread(file.finish, part.size)
+            await asyncio.to_thread(file.finish, size)
         return path
 
     # -------------------------------------------------------- events

@@ -56,9 +56,9 @@ def connect(
 ) -> Client:
     """Connect to a rig: the endpoint given, or UMBRA_RIG's, or the one on this machine.
 
-    `keys` are a client's keys or their folder; without, see `ClientKeys.default`. `timeout_s` is
-    how long an answer may take, repeats included. Raises UmbraError: unreachable,
-    version_mismatch, bad_keys.
+    `keys` are a client's keys or their folder; without, see `ClientKeys.default`; False is none at
+    all. `timeout_s` is how long an answer may take, repeats included. Raises UmbraError:
+    unreachable, version_mismatch, bad_keys, and bad_request for what is no endpoint.
     """
     return Client(endpoint, keys=keys, timeout_s=timeout_s, name=name)
 
@@ -127,7 +127,7 @@ class Client(Commands):
 
     def __repr__(self) -> str:
         state = " (closed)" if self._context.closed else ""
-        return f"<Client of {self.welcome.rig} at {self.endpoint}{state}>"
+        return f"<Client of {self.endpoint}{state}>"
 
     # -------------------------------------------------------- one request
 
@@ -183,15 +183,15 @@ class Client(Commands):
     def download(self, run: str, name: str, to: Path | str) -> Path:
         """Fetch a product's file to a path, or into a folder; the file appears when it is whole."""
         part = self.product_part(run, name)
-        path = place_for(to, part.product)
+        path, size = place_for(to, part.product), part.size
         with arrival(path) as file:
             while True:
                 file.write(part.data)
                 done = part.offset + len(part.data)
-                if done >= part.size or not part.data:
+                if done >= size or not part.data:
                     break
                 part = self.product_part(run, name, offset=done)
-            file.finish(part.size)
+            file.finish(size)
         return path
 
     # -------------------------------------------------------- events

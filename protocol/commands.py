@@ -57,14 +57,14 @@ class command(Generic[P, T]):  # noqa: N801  (a decorator, as property is)
         self._make = make
 
     @overload
-    def __get__(self, rig: None, owner: type) -> command[P, T]: ...
+    def __get__(self, rig: None, owner: type) -> Callable[Concatenate[Any, P], Ask[T]]: ...
     @overload
     def __get__(self, rig: Client, owner: type) -> Callable[P, T]: ...
     @overload
     def __get__(self, rig: AsyncClient, owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
     def __get__(self, rig: Any, owner: type) -> Any:
         if rig is None:
-            return self
+            return self._make
 
         @functools.wraps(self._make)
         def call(*args: P.args, **kwargs: P.kwargs) -> Any:

@@ -261,7 +261,7 @@ def checked(welcome: Welcome) -> Welcome:
 # ---------------------------------------------------------------- events
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Notice:
     """An event as a subscriber gets it.
 

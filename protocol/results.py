@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Picture:
     """A frame or a preview: the array, or the bytes of a PNG file, and what is known of it."""
 
@@ -27,7 +27,7 @@ class Picture:
         return f"<code>{'×'.join(map(str, self.pixels.shape))} {self.pixels.dtype}</code> {shown}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Separation:
     """Direct and global light: float32, H x W or H x W x 3 (RGB), linear camera counts.
 
@@ -93,7 +93,7 @@ def message_of(answer: Answer) -> str:
     return expect(answer.reply, m.Done).message
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Part:
     """A part of a product's file."""
 

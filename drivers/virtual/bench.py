@@ -131,6 +131,11 @@ class Bench:
                 others[k] += parts[1]
         return direct, others
 
+    def prepare(self, width: int, height: int) -> None:
+        """Build the main sources' light transport to a view of a size: a second, once."""
+        for name in self.main_sources():
+            transport(width, height, self.sources[name].pinhole)
+
     def main_sources(self) -> tuple[str, ...]:
         """The projector, or without one all lights."""
         first = [name for name, source in self.sources.items() if source.main]

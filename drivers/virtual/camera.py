@@ -21,6 +21,7 @@ from drivers.base import (
     DeviceRefused,
     DeviceTimeout,
     Frame,
+    Identity,
     Options,
     PixelFormat,
 )
@@ -137,6 +138,14 @@ class VirtualCamera(VirtualDevice, Camera):
             return round(max(fastest, NS / self._set.frame_rate_hz))
         return round(fastest)
 
+    def connect(self) -> Identity:
+        """See Device. The scene is built here, where no frame's deadline waits for it."""
+        identity = super().connect()
+        self.bench.prepare(self._o.width, self._o.height)
+        for layout in self._layouts():
+            _room(self._o.width, self._o.height, layout)
+        return identity
+
     def info(self) -> CameraInfo:
         """See Camera."""
         fastest = max(self._exposure_us * 1e3, self._o.readout_ms * 1e6)
@@ -227,10 +236,11 @@ class VirtualCamera(VirtualDevice, Camera):
         self._next += 1  # without a free buffer the frame is lost, its number used up
 
     def _run(self) -> None:
-        """Expose all that a free-running camera has exposed by now, and the frame in the making."""
+        """Expose all that a free-running camera has exposed by now, and the one in the making;
+        the next one, if there is no other to wait for."""
         period, exposure = self._period_ns, round(self._exposure_us * 1e3)
         due = (self.clock.now_ns() - self._started) // period
-        while self._next <= due and len(self._waiting) < self._o.buffers:
+        while not self._waiting or (self._next <= due and len(self._waiting) < self._o.buffers):
             start = self._started + self._next * period
             self._queue(start, start + exposure)
         self._next = max(self._next, due)

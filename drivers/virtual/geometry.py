@@ -192,7 +192,7 @@ class Pinhole:
         """Unit vectors to the right, downwards and forwards."""
         forward = unit(vector(self.target) - vector(self.position))
         right = unit(np.cross(vector((0, 1, 0)), forward).astype(np.float32))
-        return right, np.cross(right, forward).astype(np.float32) * np.float32(1), forward
+        return right, np.cross(right, forward).astype(np.float32), forward
 
     def rays(self) -> F32:
         """Directions (H, W, 3) of unit length through every pixel."""

@@ -67,7 +67,7 @@ class VirtualProjector(VirtualDevice, Projector):
         levels = (np.arange(256, dtype=np.float32) / 255) ** options.gamma
         self._tone = (options.leakage + (1 - options.leakage) * levels).astype(np.float32)
         self._pinhole = Pinhole(
-            (230.0, 420.0, -230.0), TARGET, options.width, options.height, math.radians(20.0)
+            (230.0, 420.0, -230.0), TARGET, options.width, options.height, math.radians(21.0)
         )
         self.bench.add(self)
 

@@ -74,7 +74,7 @@ THINGS = (
         gloss=0.05,
         scatter=(Scatter(45.0, (0.42, 0.25, 0.11)), Scatter(14.0, (0.16, 0.13, 0.08))),
     ),
-    Thing("ball", Sphere((-62.0, 62.0, 455.0), 62.0), (0.56, 0.42, 0.08), gloss=0.5),
+    Thing("ball", Sphere((-62.0, 62.0, 455.0), 62.0), (0.48, 0.36, 0.07), gloss=0.5),
     Thing(
         "marble",
         Block((28.0, 85.0, 745.0), (58.0, 85.0, 50.0), 0.5),
@@ -157,7 +157,7 @@ def albedo(surface: NDArray[np.intp], point: F32) -> F32:
     )
     band = np.sin(18 * v + 5 * _noise(u, v, 5, 3)) > 0
     ball = surface == ROOM + 1
-    colour = np.where((ball & band)[..., None], vector((0.52, 0.07, 0.04)), colour)
+    colour = np.where((ball & band)[..., None], vector((0.45, 0.06, 0.035)), colour)
     x, y, z = (np.asarray(point[..., k] / 220, np.float32) for k in range(3))
     vein = np.abs(_noise(x + z, y - x * np.float32(0.5), 9, 5))
     marble = np.where(surface == ROOM + 2, np.clip(0.45 + 3.5 * vein, 0.45, 1), 1)

@@ -64,7 +64,7 @@ class Transport:
         self.source = source
         patches = scene.patches()
         flat = patches.points.shape[0] * patches.points.shape[1]
-        self._bounce = patches.bounce
+        self._bounce = patches.bounce.reshape(-1, patches.bounce.shape[-1])
         self._pixels = _catch(source, seen.seen.point, seen.seen.normal)
         self._mirror = _catch(source, seen.mirrored.surface.point, seen.mirrored.surface.normal)
         self._patches = _catch(
@@ -78,7 +78,7 @@ class Transport:
         full = np.ones((source.height, source.width), np.float32)
         planes = [sum(self.render(self.light(full), k)) for k in "RGB"]
         brightest = np.max(np.stack([np.asarray(p) for p in planes]), axis=0)
-        self._unit = float(np.percentile(brightest[seen.smooth], 99.8))
+        self._unit = float(np.percentile(brightest[seen.smooth], 99.5))
 
     @property
     def correspondence(self) -> tuple[F32, F32]:
@@ -109,7 +109,8 @@ class Transport:
         caught = _gather(soft, self._patches, factor) * self._patches.strength
         n, fine = scene.CELLS, scene.FINE
         direct = caught.reshape(-1, n, fine, n, fine).mean((2, 4)).ravel()
-        bounced = (self._bounce @ direct).reshape(3, -1, n, n)
+        # On one core: a threaded product would fight with the rig's own threads for so little.
+        bounced = np.einsum("ij,j->i", self._bounce, direct).reshape(3, -1, n, n)
         return Lit(
             arriving,
             _tiles(bounced),

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from protocol.cli.delivery import Delivery
-from protocol.cli.family import member, tag_option
+from protocol.cli.family import tag_option
 from protocol.cli.link import Json
-from protocol.cli.options import build
+from protocol.cli.methods import METHODS, spec_of, union_options
+from protocol.cli.options import with_options
 from protocol.cli.output import print_facts, print_json, say
 from protocol.cli.private import private_daemon
 from protocol.cli.runs import fetch, wanted
@@ -32,7 +33,7 @@ class Demonstrated(Fetched, frozen=True, kw_only=True):
     truth: dict[str, Any]
 
 
-def demo(
+def _demo(
     *,
     method: Annotated[
         str, tag_option(AnyScan, "-m", "--method", help_text="The scan.")
@@ -45,9 +46,13 @@ def demo(
         bool, typer.Option("--force", help="Replace files in OUT (in ./umbra-demo: always).")
     ] = False,
     speed: Annotated[
-        float, typer.Option(min=0.1, max=1000, help="Of the simulated clock; 1 is real time.")
+        float,
+        typer.Option(
+            metavar="X", min=0.1, max=1000, help="Of the simulated clock; 1 is real time."
+        ),
     ] = 1.0,
     as_json: Json = False,
+    **given: Any,
 ) -> None:
     """Separate a simulated scene: the paper's 25 checkerboard images, compared with the truth.
 
@@ -57,7 +62,7 @@ def demo(
     """
     delivery = Delivery(out or OUT, force=force or out is None)
     delivery.check()
-    spec: Any = build(member(AnyScan, method, "--method"), {})
+    spec = spec_of(method, given)
     config = {"rig": {"time_scale": speed}, "storage": {"reserve_mb": 0}, **VIRTUAL}
     try:
         with private_daemon(config) as client:
@@ -90,3 +95,6 @@ def _truth(run: Run) -> dict[str, Any]:
     if not isinstance(truth, dict):
         raise UmbraError(Code.INTERNAL, "the virtual rig's run came without its truth")
     return truth
+
+
+demo = with_options(_demo, [option.parameter() for option in union_options(METHODS)])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import enum
+import math
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,6 +57,9 @@ def preview(
             Code.BAD_REQUEST, "standard output is no terminal to draw in: give -o FILE.png"
         )
     _png_name(out)
+    columns, lines = shutil.get_terminal_size()
+    if out is None:
+        width = max(16, min(width, columns))  # a character cell shows one pixel of the width
     with connect(rig, keys) as client:
         picture = client.preview(width, what.value)
     from protocol.cli.picture import in_terminal, png
@@ -66,8 +71,7 @@ def preview(
     elif out is not None:
         print(out)
     else:
-        columns, lines = shutil.get_terminal_size()
-        sys.stdout.write(in_terminal(picture.pixels, columns, lines - 2) + "\n")
+        sys.stdout.write(in_terminal(picture.pixels, columns, lines - 3) + "\n")
     if not as_json:
         _say_facts(picture.facts)
 
@@ -110,9 +114,24 @@ def _png_name(out: Path | None) -> None:
 
 
 def _say_facts(facts: dict[str, Any]) -> None:
-    told = [f"{k.replace('_', ' ')} {v:g}" for k, v in facts.items() if isinstance(v, int | float)]
+    """What one wants to know when setting the exposure; the histogram as a line of bars."""
+    told = []
+    if "exposure_us" in facts:
+        told.append(f"exposure {facts['exposure_us']:g} µs")
+    if "mean" in facts and "full_scale" in facts:
+        told.append(f"mean {facts['mean']:.0f} of {facts['full_scale']:.0f}")
+    if "saturated" in facts:
+        told.append(f"{100 * facts['saturated']:.2f} % saturated")
     if told:
-        say(", ".join(told))
+        say(" · ".join(told))
+    if facts.get("histogram") and on_terminal(sys.stderr):
+        say(bars(facts["histogram"]))
+
+
+def bars(histogram: Sequence[float]) -> str:
+    """A histogram as one line of block characters, its height the square root of the count."""
+    most = max(histogram) or 1
+    return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * math.sqrt(count / most))] for count in histogram)
 
 
 # ---------------------------------------------------------------- camera, lights

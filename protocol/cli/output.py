@@ -37,14 +37,15 @@ def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """A table; on a terminal by rich, states in their colours; else plain columns."""
     rows = [[*row] for row in rows]
     if on_terminal():
-        from rich.box import SIMPLE_HEAD
         from rich.console import Console
-        from rich.markup import escape
         from rich.table import Table
 
-        table = Table(*headings, box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
+        table = Table(box=None, header_style="bold dim", pad_edge=False, padding=(0, 2, 0, 0))
+        for i, heading in enumerate(headings):
+            # the first column names things: the others give way before a name is cut short
+            table.add_column(heading, no_wrap=i == 0)
         for row in rows:
-            table.add_row(*(coloured(cell, escape(cell)) for cell in row))
+            table.add_row(*map(coloured, row))
         Console(highlight=False).print(table)
         return
     widths = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
@@ -54,10 +55,13 @@ def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
         )
 
 
-def coloured(cell: str, text: str) -> str:
-    """rich markup for a cell that names a state."""
-    colour = COLOURS.get(cell.partition(" ")[0])
-    return f"[{colour}]{text}[/]" if colour else text
+def coloured(text: str) -> str:
+    """rich markup of a text; a state that it begins with gets its colour."""
+    from rich.markup import escape
+
+    state, space, rest = text.partition(" ")
+    colour = COLOURS.get(state)
+    return f"[{colour}]{state}[/]{space}{escape(rest)}" if colour else escape(text)
 
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:
@@ -70,7 +74,7 @@ def print_facts(facts: Iterable[tuple[str, str]]) -> None:
 
         console = Console(highlight=False)
         for name, value in shown:
-            console.print(f"[dim]{escape(name):{width}}[/]  {coloured(value, escape(value))}")
+            console.print(f"[dim]{escape(name):{width}}[/]  {coloured(value)}", soft_wrap=True)
         return
     for name, value in shown:
         print(f"{name:{width}}  {value}")

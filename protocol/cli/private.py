@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -35,14 +36,8 @@ def private_daemon(config: Mapping[str, Any]) -> Iterator[Client]:
     """
     folder = _private_folder()
     try:
-        command = f"ipc://{folder}/command"
-        whole = {
-            "rig": {"name": "private", "data": str(folder / "data")},
-            "network": {"command": command, "events": f"ipc://{folder}/events"},
-            **config,
-        }
         file = folder / "rig.toml"
-        file.write_text(toml(whole), encoding="utf-8")
+        file.write_text(toml(configured(config, folder)), encoding="utf-8")
         with (folder / "log").open("wb") as log:
             process = subprocess.Popen(
                 # -P: a file in the user's folder must not pass for one of the daemon's modules
@@ -54,12 +49,39 @@ def private_daemon(config: Mapping[str, Any]) -> Iterator[Client]:
                 start_new_session=True,  # Ctrl-C is for us: we stop it in good order
             )
         try:
-            with _when_ready(process, command, folder / "log") as client:
+            with (
+                _ends_in_order(),
+                _when_ready(process, f"ipc://{folder}/command", folder / "log") as client,
+            ):
                 yield client
         finally:
             _stop(process)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def configured(config: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A whole rig.toml: these tables, and everything that is written kept within the folder."""
+    return {
+        **config,
+        "rig": {**config.get("rig", {}), "name": "private", "data": f"{folder}/data"},
+        "network": {"command": f"ipc://{folder}/command", "events": f"ipc://{folder}/events"},
+    }
+
+
+@contextmanager
+def _ends_in_order() -> Iterator[None]:
+    """SIGTERM and SIGHUP become SystemExit in here, so that what was started is cleared away."""
+
+    def leave(number: int, _frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = {number: signal.signal(number, leave) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _private_folder() -> Path:

@@ -72,7 +72,9 @@ def devices(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
 
 
 def _device_facts(device: DeviceInfo) -> str:
-    return ", ".join(f"{name} {_short(value)}" for name, value in device.facts.items())
+    """What is true without its value, what is false, empty or unknown not at all."""
+    told = {k: v for k, v in device.facts.items() if v not in (None, "", False)}
+    return ", ".join(k if v is True else f"{k} {_short(v)}" for k, v in told.items())
 
 
 def _short(value: Any) -> str:
@@ -122,15 +124,18 @@ def log(
 
 
 def log_line(record: dict[str, Any]) -> str:
-    """A log record as one line: time, level, what happened, and the rest as key=value."""
-    rest = dict(record)
-    time = str(rest.pop("timestamp", rest.pop("ts", "")))
+    """A log record as one line: time, level, what happened, the rest as key=value; a traceback,
+    where there is one, below it."""
+    rest = {name: value for name, value in record.items() if value not in ("", None)}
+    time = str(rest.pop("timestamp", ""))
     level = str(rest.pop("level", "")).upper()
-    event = str(rest.pop("event", rest.pop("message", "")))
+    event = str(rest.pop("event", ""))
+    trace = str(rest.pop("exception", ""))
     if on_terminal() and len(time) > 19:
         time = time[11:23]
     values = " ".join(f"{name}={value}" for name, value in rest.items())
-    return "  ".join(part for part in (time, f"{level:7}", event, values) if part.strip())
+    line = "  ".join(part for part in (time, f"{level:7}", event, values) if part.strip())
+    return "\n    ".join([line, *trace.splitlines()])
 
 
 def stop(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:

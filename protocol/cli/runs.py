@@ -138,6 +138,9 @@ def fetch(client: Client, info: RunInfo, delivery: Delivery, names: list[str]) -
 # ---------------------------------------------------------------- steering
 
 
+_SOON = {"pause": "pauses after this step", "abort": "is being aborted", "resume": "goes on"}
+
+
 def _steer(verb: str, run: str, rig: str | None, keys: str | None, as_json: bool) -> None:
     with connect(rig, keys) as client:
         which = run or client.run_info().id
@@ -146,7 +149,8 @@ def _steer(verb: str, run: str, rig: str | None, keys: str | None, as_json: bool
     if as_json:
         print_json(Run(run=info))
     else:
-        print(f"run {info.id}: {info.state.value}")
+        under_way = not info.state.ended and info.state is not RunState.PAUSED
+        print(f"run {info.id}: {_SOON[verb] if under_way else info.state.value}")
 
 
 def pause(run: RunId = "", rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:

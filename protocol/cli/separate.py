@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from protocol.cli.delivery import Delivery
-from protocol.cli.family import member, members, tag_option
+from protocol.cli.family import tag_option
 from protocol.cli.link import Json
-from protocol.cli.options import Option, build, options_of, with_options
+from protocol.cli.methods import METHODS, spec_of, union_options
+from protocol.cli.options import with_options
 from protocol.cli.output import print_json, say
 from protocol.cli.private import private_daemon
 from protocol.cli.runs import Force, fetch, wanted
@@ -26,9 +26,9 @@ from protocol.scans import AnyScan, Reference
 if TYPE_CHECKING:
     from protocol.client import Client
 
-METHODS = members(AnyScan)
 LIVE = {"exposure_us", "gain", "references"}
 """Fields that are no options here: the photographs have them, or the files given say them."""
+OPTIONS = union_options(METHODS, without=LIVE)
 
 
 class Bayer(enum.StrEnum):
@@ -61,6 +61,9 @@ def _separate(
     bayer: Annotated[
         Bayer | None, typer.Option(help="The images are a raw colour mosaic that begins so.")
     ] = None,
+    match: Annotated[
+        str, typer.Option(metavar="GLOB", help="Which of the folder's names are frames.")
+    ] = "*",
     force: Force = False,
     as_json: Json = False,
     **given: Any,
@@ -78,7 +81,7 @@ def _separate(
         Reference.AMBIENT: ambient_frame,
     }
     first = {kind: file.absolute() for kind, file in shots.items() if file is not None}
-    spec = spec_of(method, given, list(first))
+    spec = spec_of(method, given, references=list(first))
     delivery = Delivery(out, force=force)
     delivery.check()
     for file in (source, *first.values()):
@@ -89,6 +92,7 @@ def _separate(
             "driver": "replay",
             "path": str(source.absolute()),
             "first": [str(file) for file in first.values()],
+            "match": match,
             "bayer": bayer.value if bayer else None,
         },
         # the photographs are the originals: no second copy of them
@@ -105,23 +109,6 @@ def _separate(
         say(f"\numbra: stopped; nothing was written to {out}")
         raise
     report(run.info, files, as_json)
-
-
-def spec_of(method: str, given: dict[str, Any], references: list[Reference]) -> AnyScan:
-    """The spec of a recorded scan. Raises UmbraError for an option of another method."""
-    struct: Any = member(AnyScan, method, "--method")
-    own = {option.name: option for option in union_options([method])}
-    for option in union_options(METHODS):
-        if given.get(option.name) is not None and option.name not in own:
-            theirs = [m for m in METHODS if option.name in {o.name for o in options_of(METHODS[m])}]
-            raise UmbraError(
-                Code.BAD_REQUEST,
-                f"{option.flag} is not an option of {method}, but of {', '.join(theirs)}",
-                option.flag,
-            )
-    fields = {name: value for name, value in given.items() if name in own}
-    made: AnyScan = build(struct, fields, references=references)
-    return made
 
 
 def usable(client: Client) -> None:
@@ -141,30 +128,4 @@ def report(info: RunInfo, files: Iterable[Path], as_json: bool) -> None:
         print(file)
 
 
-def union_options(methods: Iterable[str]) -> list[Option]:
-    """The options of these methods together; a help line names the methods if not all have it."""
-    options: dict[str, list[Option]] = {}
-    having: dict[str, list[str]] = {}
-    methods = list(methods)
-    for method in methods:
-        for option in options_of(METHODS[method]):
-            if option.name not in LIVE:
-                options.setdefault(option.name, []).append(option)
-                having.setdefault(option.name, []).append(method)
-    found = []
-    for name, same in options.items():
-        defaults = {option.default for option in same}
-        only = "" if len(same) == len(methods) else f" ({', '.join(having[name])})"
-        found.append(
-            replace(
-                same[0],
-                help=f"{same[0].help}{only}",
-                choices=tuple(dict.fromkeys(c for option in same for c in option.choices)),
-                default=same[0].default if len(defaults) == 1 else None,
-                required=False,
-            )
-        )
-    return found
-
-
-separate = with_options(_separate, [option.parameter() for option in union_options(METHODS)])
+separate = with_options(_separate, [option.parameter() for option in OPTIONS])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from protocol.cli.exits import Exit
 from protocol.cli.link import Json, Keys, Rig, RunId, connect
 from protocol.cli.output import on_terminal, print_json, say, seconds
-from protocol.cli.words import ending, frames, method
+from protocol.cli.words import ending, frames
 from protocol.errors import Code, UmbraError
 from protocol.messages import Progress, RunInfo, RunState
 
@@ -51,7 +51,7 @@ def follow(run: Run, *, as_json: bool = False, title: str = "") -> RunInfo:
         for progress in news:
             print_json(progress, lines=True)
     else:
-        show_progress(news, title or f"{run.id} {method(run.info)}")
+        show_progress(news, title or run.id)
     return run.info
 
 

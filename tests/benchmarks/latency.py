@@ -12,14 +12,13 @@ import time
 import zmq
 
 from protocol.messages import PROTOCOL
-from protocol.scans import Checkerboard
 from tests.benchmarks.bench import daemon
-from tests.benchmarks.pace import DEVICES, EXPOSURE_S
+from tests.benchmarks.pace import DEVICES, scan
 from tests.benchmarks.ratio import Ratio, percentile
 
 ROUNDS = 1000
 PAUSE_S = 0.005  # between two questions: a client that asks all the time is another load
-SCAN = Checkerboard(checker=8, shift=4, shifts=4, average=100, exposure_us=EXPOSURE_S * 1e6)
+EXPOSURE_S = 12e-3  # one pattern a refresh
 
 ECHO = """
 import sys, zmq
@@ -37,7 +36,7 @@ def run() -> list[Ratio]:
         echo = subprocess.Popen([sys.executable, "-c", ECHO, address])
         context = zmq.Context()
         try:
-            scan = rig.client.scan(SCAN)
+            running = rig.client.scan(scan(EXPOSURE_S, average=100))
             lines = [_line(context, address), _line(context, rig.endpoint)]
             times: list[list[float]] = [[], []]
             for number in range(ROUNDS + 10):
@@ -46,14 +45,14 @@ def run() -> list[Ratio]:
                     if number >= 10:
                         taken.append(seconds)
                 time.sleep(PAUSE_S)
-            during = rig.client.run_info(scan.id)
-            rig.client.abort(scan.id)
+            progress = rig.client.status().progress
+            rig.client.abort(running.id)
         finally:
             context.destroy(linger=0)
             echo.kill()
             echo.wait()
-    if during.state != "running":
-        raise RuntimeError(f"the scan was {during.state} before the measurement ended")
+    if progress is None:
+        raise RuntimeError("the scan was over before the measurement ended")
     bare, umbra = times
     p99 = [percentile(bare, 0.99), percentile(umbra, 0.99)]
     return [
@@ -67,7 +66,7 @@ def run() -> list[Ratio]:
                 "umbra_p99_ms": p99[1] * 1e3,
                 "echo_median_ms": percentile(bare, 0.5) * 1e3,
                 "umbra_median_ms": percentile(umbra, 0.5) * 1e3,
-                "frames_meanwhile": float(during.recorded),
+                "frames_meanwhile": float(progress.recorded),
             },
         )
     ]

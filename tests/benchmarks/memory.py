@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from protocol.scans import Checkerboard
 from tests.benchmarks.bench import daemon
-from tests.benchmarks.pace import DEVICES, EXPOSURE_S
+from tests.benchmarks.pace import DEVICES
 from tests.benchmarks.ratio import Ratio
 
 FEW, MANY = 25, 1000
@@ -26,7 +26,7 @@ def run() -> list[Ratio]:
 
 def _peak(average: int) -> int:
     scan = Checkerboard(
-        checker=8, shift=3, shifts=5, average=average, references=(), exposure_us=EXPOSURE_S * 1e6
+        checker=8, shift=3, shifts=5, average=average, references=(), exposure_us=12_000
     )
     with daemon(DEVICES) as rig:
         info = rig.client.scan(scan).wait(300)

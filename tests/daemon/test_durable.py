@@ -66,6 +66,11 @@ def test_disk_errors_name_phase_and_place(number: int, code: Code) -> None:
     assert caught.value.code is code
 
 
+def test_a_read_only_disk_has_its_own_remedy() -> None:
+    with pytest.raises(StorageError, match="mount it for writing"), storage("creating a run"):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+
 def test_a_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError):

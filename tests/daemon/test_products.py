@@ -171,6 +171,18 @@ def test_the_preview_shows_the_white_frame_that_was_recorded(run: RunFolder) -> 
     assert without.shape[1] == 3 * width + 4 * 12
 
 
+def test_a_picture_stands_in_for_a_frame_that_was_not_kept(run: RunFolder) -> None:
+    frames = FrameStore.create(run.path, SIZE, "uint16", pixels=False)
+    record = FrameRecord(index=0, step=0, observation=Observation())
+    frames.append(np.zeros(SIZE, "uint16"), record)
+    frames.commit()
+    stand_in = np.full((12, 16, 3), (200, 20, 20), np.uint8)
+    files = write(run, components(), pixel_format=PixelFormat.MONO10, frame=stand_in)
+    picture = cv2.imread(str(files["preview"]))
+    assert picture is not None
+    assert picture[-20, 20].tolist() == [20, 20, 200]
+
+
 # ---------------------------------------------------------------- for eyes
 
 

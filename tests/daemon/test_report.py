@@ -83,7 +83,7 @@ def test_one_file_that_loads_nothing() -> None:
     page = Page(text)
     images = [attrs["src"] or "" for tag, attrs in page.seen if tag == "img"]
     assert len(images) == 4
-    assert all(re.match(r"data:image/(jpeg|png);base64,[A-Za-z0-9+/=]+$", src) for src in images)
+    assert all(re.match(r"data:image/jpeg;base64,[A-Za-z0-9+/=]+$", src) for src in images)
     for tag, attrs in page.seen:
         assert tag not in {"link", "iframe", "object", "base"}
         for name in ("src", "href", "srcset", "action"):

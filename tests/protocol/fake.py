@@ -38,6 +38,7 @@ class FakeRig:
         *,
         server_keys: KeyPair | None = None,
         command: str = "tcp://127.0.0.1:0",
+        events: str = "tcp://127.0.0.1:0",
         allow: list[bytes] | None = None,
         protocol: int = m.PROTOCOL,
     ) -> None:
@@ -48,6 +49,8 @@ class FakeRig:
         self.copies = 1  # how often each answer is sent
         self.hold_back = 0  # answers to send only together with the next one's
         self.before: list[Frames] = []  # messages to send ahead of the next answer
+        self.mangle: Callable[[Frames], Frames] | None = None  # applied to each answer
+        self.on_request: Callable[[m.Request], object] | None = None
         self.refuse: dict[str, ErrorInfo] = {}  # by command tag
         self.arrays: dict[str, np.ndarray[Any, Any]] = {
             "direct": np.arange(12, dtype=np.float32).reshape(3, 4),
@@ -78,7 +81,7 @@ class FakeRig:
                 socket.curve_publickey = server_keys.public
                 socket.curve_secretkey = server_keys.secret
         self._router.bind(command)
-        self._pub.bind("tcp://127.0.0.1:0")
+        self._pub.bind(events)
         self.endpoint = _bound(self._router)
         self.events = _bound(self._pub)
         self.subscribed = threading.Semaphore(0)
@@ -146,6 +149,11 @@ class FakeRig:
             self.publish(m.RunChanged(run=info), lose=lose)
         return info
 
+    def await_subscribers(self, count: int) -> None:
+        """Wait until so many subscriptions (one a topic) have arrived since the last call."""
+        for _ in range(count):
+            assert self.subscribed.acquire(timeout=10)
+
     def new_epoch(self) -> None:
         """As after a restart: counters begin again."""
         self.epoch = uuid.uuid4().hex
@@ -171,6 +179,7 @@ class FakeRig:
                 self._answer(*self._router.recv_multipart())
 
     def _answer(self, identity: bytes, header: bytes, *_: bytes) -> None:
+        request: m.Request | None
         try:
             preamble = msgspec.json.decode(header, type=m.Preamble)
             self._check(preamble.protocol)
@@ -184,6 +193,11 @@ class FakeRig:
             message = self._answers[request.id]
         except UmbraError as error:
             message = encode(m.Response(id=preamble.id, error=error.info))
+            request = None
+        if self.on_request is not None and request is not None:
+            self.on_request(request)
+        if self.mangle is not None:
+            message = list(self.mangle([bytes(part) for part in message]))
         if self.drop:
             self.drop -= 1
             return
@@ -198,7 +212,7 @@ class FakeRig:
             self._router.send_multipart(late)
         self._held.clear()
         for _copy in range(self.copies):
-            self._router.send_multipart([identity, *message], copy=False)
+            self._router.send_multipart([identity, *message])
 
     def _check(self, theirs: int) -> None:
         if theirs != self.protocol:
@@ -313,6 +327,4 @@ class _Allowed:
         self.keys = keys
 
     def callback(self, _domain: str, key: bytes) -> bool:
-        from zmq.utils import z85
-
-        return z85.encode(key) in self.keys
+        return key in self.keys

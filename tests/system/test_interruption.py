@@ -6,7 +6,6 @@ import json
 
 import numpy as np
 import pytest
-from conftest import Daemon, recorded, until
 
 import umbra
 from daemon.frames import FrameStore
@@ -15,6 +14,7 @@ from daemon.scans.method import Bench
 from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
 from protocol.errors import Code, UmbraError
 from protocol.messages import RunState
+from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system
 

@@ -1,0 +1,391 @@
+"""What all cameras that hand out buffers share: order of calls, halting, late frames, times.
+
+A driver says how its camera is opened, set, armed and read; this module makes a Camera of it.
+
+    closed ──connect──> idle ──start──> acquiring ──stop──> idle;  any ──close──> closed
+    acquiring ──halt──> halted ──start, stop──> acquiring, idle
+
+Retry policy. `configure`, `start`, `stop` and `check` may be sent again. `trigger` may not: the
+camera may have exposed. When a triggered frame did not come, the acquisition is restarted before
+the next trigger, so that a late frame is never taken for the next one. After DeviceLost, call
+`connect` again: it applies the settings that were in force.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import (
+    Acquisition,
+    Camera,
+    CameraInfo,
+    CameraSettings,
+    Context,
+    DeviceError,
+    DeviceGarbled,
+    DeviceRefused,
+    DeviceTimeout,
+    Frame,
+    Identity,
+    Options,
+)
+from drivers.clock import NS
+from drivers.devicetime import DeviceTime
+from drivers.unpack import Layout, unpack
+
+WRAP = 65535  # GigE Vision's frame ids go from 1 to this
+HALT_SLICE_S = 0.02  # a wait inside a library cannot be woken: so long is it until `halt` is seen
+
+
+class StreamingOptions(Options, frozen=True, kw_only=True):
+    """Keys that all these cameras understand, beside those that tell which camera it is."""
+
+    exposure_us: float | None = None
+    gain: float | None = None  # in the camera's own unit, mostly dB
+    frame_rate_hz: float | None = None  # free-running
+    roi: tuple[int, int, int, int] | None = None  # x, y, width, height
+    black_level: float = 0.0  # nominal counts in the dark
+    buffers: int = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Buffer:
+    """What a library handed out: flat bytes that are valid until `release`."""
+
+    data: NDArray[np.uint8]
+    width: int
+    height: int
+    block_id: int | None  # the camera's own count, GigE Vision's goes from 65535 to 1; None: unsaid
+    device_ns: int  # on the camera's clock; 0: it has none
+    release: Callable[[], None]
+    stride: int | None = None  # bytes from row to row; None: rows follow without a gap
+    incomplete: bool = False
+
+
+class StreamingCamera(Camera):
+    """See the module. A driver implements the methods below `what a driver adds`."""
+
+    options_type: ClassVar[type[Options]] = StreamingOptions
+    options: StreamingOptions
+
+    def __init__(self, name: str, options: StreamingOptions, context: Context) -> None:
+        super().__init__(name, options, context)
+        self._halted = threading.Event()
+        self._acquisition: Acquisition | None = None
+        self._identity = Identity("")
+        self._info: CameraInfo | None = None
+        self._settings = CameraSettings()
+        self._wanted = CameraSettings()  # to be set again after a loss
+        self._triggered: deque[tuple[int, int]] = deque()  # exposures whose frames are to come
+        self._late = False  # a triggered frame did not come, and may yet
+        self._incomplete = 0
+        self._sequence = -1
+        self._last_id: int | None = None
+        self._time = DeviceTime()
+
+    # ------------------------------------------------------------ what a driver adds
+
+    @abstractmethod
+    def _open(self) -> Identity:
+        """Open the camera that the options name, all automatic corrections off."""
+
+    @abstractmethod
+    def _apply(self, wanted: CameraSettings, phase: str) -> None:
+        """Change settings; everything is checked before anything is set. Raises DeviceRefused."""
+
+    @abstractmethod
+    def _read(self) -> tuple[CameraInfo, CameraSettings]:
+        """What is in force, asked from the camera."""
+
+    @abstractmethod
+    def _layout(self) -> Layout:
+        """How its buffers are laid out; no I/O."""
+
+    @abstractmethod
+    def _arm(self, acquisition: Acquisition) -> None:
+        """Say what makes it expose."""
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Announce buffers and start streaming."""
+
+    @abstractmethod
+    def _fire(self) -> None:
+        """Begin one exposure; returns when the camera has taken the command."""
+
+    @abstractmethod
+    def _next(self, timeout_s: float) -> Buffer | None:
+        """The next buffer, None if there was none in time. Raises DeviceLost."""
+
+    @abstractmethod
+    def _end(self) -> None:
+        """Stop streaming; buffers not fetched are forgotten. Idempotent."""
+
+    @abstractmethod
+    def _release(self) -> None:
+        """Let go of the camera. Idempotent; does not raise for one that is gone."""
+
+    @abstractmethod
+    def _errors(self, phase: str) -> AbstractContextManager[None]:
+        """Turns the library's exceptions into DeviceErrors."""
+
+    def _synchronise(self) -> bool:
+        """Pair the camera's clock with the rig's in `_time`; False if that takes frames."""
+        return False
+
+    def _ready(self) -> None:
+        """Wait until the camera takes a trigger, where the library can tell."""
+
+    def _still_there(self, phase: str) -> None:
+        """Raise DeviceLost if no frame came because there is no camera any more."""
+
+    # ------------------------------------------------------------ life
+
+    def connect(self) -> Identity:
+        """Open it, switch automatic corrections off, apply the options and the last settings."""
+        self.close()
+        mine = self.options
+        stated = CameraSettings(mine.exposure_us, mine.gain, None, mine.frame_rate_hz, mine.roi)
+        try:
+            with self._errors("connect"):
+                self._identity = self._open()
+                self._apply(_merged(stated, self._wanted), "connect")
+                self._info, self._settings = self._read()
+        except BaseException:
+            self.close()
+            raise
+        return self._identity
+
+    def safe(self) -> None:
+        """Stopped."""
+        self.stop()
+
+    def halt(self) -> None:
+        """See Device. A waiting grab or trigger raises within 20 ms; `start` clears it."""
+        self._halted.set()
+
+    def close(self) -> None:
+        """See Device."""
+        # A camera that is gone cannot be stopped: that it is gone is known already.
+        with contextlib.suppress(DeviceError):
+            self.stop()
+        self._release()
+        self._acquisition = self._info = None
+
+    def facts(self) -> dict[str, Any]:
+        """Identity, and how many frames came incomplete."""
+        return {
+            "model": self._identity.model,
+            "serial": self._identity.serial,
+            "incomplete": self._incomplete,
+        }
+
+    # ------------------------------------------------------------ settings
+
+    def info(self) -> CameraInfo:
+        """See Camera."""
+        if self._info is None:
+            raise self._refused("info", "not connected", "connect it first")
+        return self._info
+
+    def settings(self) -> CameraSettings:
+        """See Camera."""
+        self.info()
+        return self._settings
+
+    def configure(self, wanted: CameraSettings) -> CameraSettings:
+        """See Camera. Everything is checked against the camera's ranges before anything is set."""
+        self._connected("configure")
+        if self._acquisition is not None:
+            raise self._refused("configure", "it is acquiring", "stop it first")
+        with self._errors("configure"):
+            self._apply(wanted, "configure")
+            self._info, self._settings = self._read()
+        self._wanted = _merged(self._wanted, wanted)
+        return self._settings
+
+    # ------------------------------------------------------------ acquisition
+
+    def start(self, acquisition: Acquisition, at: int = 0) -> None:
+        """See Camera; `at` is for recordings."""
+        del at
+        self._connected("start")
+        self.stop()
+        self._halted.clear()
+        triggers = self.info().triggers
+        if acquisition is not Acquisition.FREE and acquisition.value not in triggers:
+            raise self._refused(
+                "start",
+                f"it has no {acquisition} trigger",
+                f"it has {', '.join(triggers)}",
+            )
+        with self._errors("start"):
+            self._arm(acquisition)
+            self._run()
+        self._acquisition = acquisition
+
+    def _run(self) -> None:
+        self._triggered.clear()
+        self._late = False
+        self._sequence, self._last_id = -1, None
+        self._time.forget()
+        self._synchronise()
+        self._begin()
+
+    def trigger(self) -> tuple[int, int]:
+        """See Camera: from before the command was sent to an exposure after it was taken."""
+        self._connected("trigger")
+        if self._acquisition is not Acquisition.SOFTWARE:
+            raise self._refused("trigger", "it does not wait for software", "start it so")
+        self._unless_halted("trigger")
+        with self._errors("trigger"):
+            if self._late:
+                self._end()
+                self._run()
+            self._ready()
+            before = self.clock.now_ns()
+            self._fire()
+        exposure = (before, self.clock.now_ns() + self._exposure_ns)
+        self._triggered.append(exposure)
+        return exposure
+
+    def grab(self, out: NDArray[Any], timeout_s: float) -> Frame:
+        """See Camera. Of an incomplete frame the pixels that did not come are anything."""
+        info = self.info()
+        if self._acquisition is None:
+            raise self._refused("grab", "not started", "start it first")
+        if out.shape != info.shape or out.dtype != info.pixel_format.dtype:
+            raise self._refused(
+                "grab",
+                f"frames are {info.shape} {info.pixel_format.dtype}, "
+                f"the buffer is {out.shape} {out.dtype}",
+                "make the buffer from `info()`",
+            )
+        with self._errors("grab"):
+            buffer = self._wait(timeout_s)
+            now = self.clock.now_ns()
+            try:
+                self._unpack(buffer, out)
+            finally:
+                buffer.release()
+            start, end = self._interval(buffer.device_ns, now)
+        self._incomplete += buffer.incomplete
+        return Frame(
+            pixels=out,
+            sequence=self._count(buffer.block_id),
+            start_ns=start,
+            end_ns=end,
+            utc_ns=start + self.clock.utc_ns() - self.clock.now_ns(),
+            exposure_us=self._settings.exposure_us or 0.0,
+            gain=self._settings.gain or 0.0,
+            incomplete=buffer.incomplete,
+        )
+
+    def stop(self) -> None:
+        """See Camera."""
+        if self._acquisition is None:
+            return
+        self._acquisition = None
+        with self._errors("stop"):
+            self._end()
+
+    def _wait(self, timeout_s: float) -> Buffer:
+        deadline = self.clock.now_ns() + round(timeout_s * NS)
+        while True:
+            self._unless_halted("grab")
+            left = (deadline - self.clock.now_ns()) / NS
+            buffer = self._next(min(max(left, 0.0), HALT_SLICE_S))
+            if buffer is not None:
+                return buffer
+            if left <= 0:
+                break
+        self._still_there("grab")
+        self._late = self._acquisition is Acquisition.SOFTWARE
+        remedies = {
+            Acquisition.SOFTWARE: "trigger again",
+            Acquisition.HARDWARE: "check the trigger's wiring, line and edge",
+        }
+        remedy = remedies.get(self._acquisition or Acquisition.FREE, "check cable and bandwidth")
+        raise DeviceTimeout(self.name, "grab", f"no frame within {timeout_s:g} s", remedy)
+
+    def _unpack(self, buffer: Buffer, out: NDArray[Any]) -> None:
+        info = self.info()
+        problem = ""
+        if (buffer.width, buffer.height) == (info.width, info.height):
+            try:
+                unpack(buffer.data, self._layout(), out, buffer.stride)
+            except ValueError as error:
+                problem = str(error)
+        else:
+            problem = f"a frame of {buffer.width} x {buffer.height} came"
+        if problem and not buffer.incomplete:
+            raise DeviceGarbled(
+                self.name,
+                "grab",
+                f"{problem}; it was set to {info.width} x {info.height} {info.pixel_format}",
+                "does another program control it? connect again",
+            )
+
+    def _count(self, block_id: int | None) -> int:
+        """The frame's number since `start`, lost ones counted."""
+        step = 1
+        if block_id is not None and self._last_id is not None:
+            step = block_id - self._last_id
+            if step < -WRAP // 2:
+                step += WRAP
+        if block_id is not None:
+            self._last_id = block_id
+        elif self._last_id is not None:
+            self._last_id = self._last_id % WRAP + 1 if self._last_id <= WRAP else self._last_id + 1
+        self._sequence += max(step, 1)
+        return self._sequence
+
+    # ------------------------------------------------------------ time
+
+    @property
+    def _exposure_ns(self) -> int:
+        return round((self._settings.exposure_us or 0.0) * 1000)
+
+    def _interval(self, device_ns: int, now_ns: int) -> tuple[int, int]:
+        """When the exposure of a frame that came now began and ended, by the best that is known:
+        the camera's synchronised clock, our trigger, its clock against arrivals, the arrival."""
+        triggered = self._triggered.popleft() if self._triggered else None
+        length = self._exposure_ns
+        if device_ns and self._synchronise():
+            start = self._time.to_rig(device_ns)
+            return start, start + length
+        if triggered is not None:
+            return triggered
+        start = now_ns - length - round(self.info().readout_s * NS)
+        if device_ns:
+            self._time.observe(device_ns, start)
+            start = self._time.to_rig(device_ns)
+        return start, start + length
+
+    # ------------------------------------------------------------ errors
+
+    def _connected(self, phase: str) -> None:
+        if self._info is None:
+            raise self._refused(phase, "not connected", "connect it first")
+
+    def _unless_halted(self, phase: str) -> None:
+        if self._halted.is_set():
+            raise self._refused(phase, "halted", "start it again")
+
+    def _refused(self, phase: str, problem: str, remedy: str) -> DeviceRefused:
+        return DeviceRefused(self.name, phase, problem, remedy)
+
+
+def _merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:
+    given = {f.name: getattr(over, f.name) for f in fields(over)}
+    return replace(under, **{name: v for name, v in given.items() if v is not None})
