@@ -14,7 +14,6 @@ from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
 
-
 _RESIDUAL = 0.02
 """Part of the light by which a pattern and its complement may miss black and white together."""
 
