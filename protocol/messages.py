@@ -648,6 +648,15 @@ class RigChanged(EventBody, frozen=True, kw_only=True, tag="rig-changed"):
     reason: str = ""
 
 
+class StageChanged(EventBody, frozen=True, kw_only=True, tag="stage-changed"):
+    """The stage is moved by hand: told a few times a second, and when it has come to rest."""
+
+    topic: ClassVar[str] = "stage"
+    state: StageState
+    position_mm: tuple[float, float] | None  # None while it is unknown
+    detail: str = ""  # why it stopped short
+
+
 class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
     """A small picture of the latest frame or separation. Array: `preview` (uint8, RGB)."""
 
@@ -657,7 +666,10 @@ class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
     facts: dict[str, Any] = {}
 
 
-AnyEvent = RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | PreviewTaken
+AnyEvent = (
+    RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | StageChanged
+    | PreviewTaken
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- envelopes

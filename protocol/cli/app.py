@@ -46,6 +46,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "snap": ("hand:snap", "Take one frame and save it as PNG."),
         "camera": ("hand:camera", "Read or change the camera's settings."),
         "light": ("hand:light", "Switch a light on or off."),
+        "stage": ("stage:app", "Where the stage is; home, move, circle, stop, unlock."),
     },
 }
 
