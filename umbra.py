@@ -4,9 +4,22 @@ from protocol.aio import AsyncClient
 from protocol.client import Client, connect
 from protocol.errors import Code, UmbraError
 from protocol.patterns import BLACK, WHITE, Checker, Solid
-from protocol.scans import Checkerboard, Radiometry, Reference, Stick, TwoImage
+from protocol.scans import (
+    CalibrateDark,
+    CalibrateLatency,
+    CalibrateLeak,
+    CalibrateNoise,
+    CalibrateTone,
+    Checkerboard,
+    Radiometry,
+    Reference,
+    Stick,
+    TwoImage,
+)
 
 __all__ = [
-    "BLACK", "WHITE", "AsyncClient", "Checker", "Checkerboard", "Client", "Code", "Radiometry",
+    "BLACK", "WHITE", "AsyncClient", "CalibrateDark", "CalibrateLatency",
+    "CalibrateLeak", "CalibrateNoise", "CalibrateTone", "Checker", "Checkerboard", "Client",
+    "Code", "Radiometry",
     "Reference", "Solid", "Stick", "TwoImage", "UmbraError", "connect",
 ]  # fmt: skip

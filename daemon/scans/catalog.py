@@ -4,16 +4,36 @@ from __future__ import annotations
 
 from typing import Any
 
+from daemon.scans.calibrate_dark import DarkMethod
+from daemon.scans.calibrate_latency import LatencyMethod
+from daemon.scans.calibrate_leak import LeakMethod
+from daemon.scans.calibrate_noise import NoiseMethod
+from daemon.scans.calibrate_tone import ToneMethod
 from daemon.scans.checkerboard import CheckerboardMethod
 from daemon.scans.method import Bench, Method, Unsuitable
 from daemon.scans.stick import StickMethod
 from daemon.scans.two_image import TwoImageMethod
-from protocol.scans import AnyScan, Checkerboard, Stick, TwoImage
+from protocol.scans import (
+    AnyScan,
+    CalibrateDark,
+    CalibrateLatency,
+    CalibrateLeak,
+    CalibrateNoise,
+    CalibrateTone,
+    Checkerboard,
+    Stick,
+    TwoImage,
+)
 
 _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     Checkerboard: CheckerboardMethod,
     TwoImage: TwoImageMethod,
     Stick: StickMethod,
+    CalibrateDark: DarkMethod,
+    CalibrateNoise: NoiseMethod,
+    CalibrateLeak: LeakMethod,
+    CalibrateTone: ToneMethod,
+    CalibrateLatency: LatencyMethod,
 }
 
 NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())

@@ -16,7 +16,7 @@ from protocol.cli.runs import Force, fetch, wanted
 from protocol.cli.watch import conclude, follow, goes_on
 from protocol.cli.words import Fetched
 from protocol.messages import Run
-from protocol.scans import AnyScan
+from protocol.scans import AnyCalibration, AnyScan, AnySeparation
 
 
 def scan(
@@ -72,9 +72,18 @@ def scan(
 class Methods(Family):
     """One command a scan method."""
 
-    union = AnyScan
+    union = AnySeparation
     act = scan
     title = "Methods"
+
+
+class Calibrations(Family):
+    """One command a calibration."""
+
+    union = AnyCalibration
+    act = scan
+    title = "Calibrations"
+    prefix = "calibrate-"
 
 
 app = typer.Typer(cls=Methods, rich_markup_mode=None, add_completion=False)
@@ -93,4 +102,21 @@ def _scan(context: typer.Context, rig: Rig = None, keys: Keys = None) -> None:
         typer.echo(context.get_help())
 
 
-__all__: list[Any] = ["app", "scan"]
+calibrate = typer.Typer(cls=Calibrations, rich_markup_mode=None, add_completion=False)
+
+
+@calibrate.callback(invoke_without_command=True)
+def _calibrate(context: typer.Context, rig: Rig = None, keys: Keys = None) -> None:
+    """Queue a calibration of the rig; prints the run's id. Later runs apply it by themselves.
+
+    It is applied while the devices are the same ones and it is not too old (rig.toml:
+    calibration.max_age_days). --wait and -o DIR as in `umbra scan`.
+
+    --json: a Run; with -o {"run": RunInfo, "files": [path, ...]}.
+    """
+    context.obj = {"rig": rig, "keys": keys}
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+__all__: list[Any] = ["app", "calibrate", "scan"]
