@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from daemon import __version__, discovery, picture, products
+from daemon import __version__, discovery, measured, picture, products
 from daemon.config import RigConfig
 from daemon.logs import LogBook
 from daemon.manual import Manual
@@ -18,7 +18,7 @@ from daemon.publisher import Publisher
 from daemon.rig import SAFE_S, Rig
 from daemon.runner import LOCK, Runner
 from daemon.scans import catalog
-from daemon.separation.estimator import Components
+from daemon.separation.estimator import Components, Result
 from daemon.server import Answer, Caller
 from daemon.store import RunFolder, Store
 from daemon.viewfinder import Viewfinder, facts_of
@@ -237,25 +237,25 @@ class Commands:
     async def _result(self, command: m.GetResult, _: _Asked) -> Answer:
         def result() -> Answer:
             run = self._runner.find(command.run)
-            components, facts = self._components(run)
+            found, facts = self._result_of(run)
+            reply = m.Result(run=run.info(), final=run.file.state is m.RunState.DONE, facts=facts)
+            if not isinstance(found, Components):
+                return Answer(reply)
             return Answer(
-                m.Result(run=run.info(), final=run.file.state is m.RunState.DONE, facts=facts),
-                {
-                    "direct": components.direct,
-                    "global": components.global_,
-                    "quality": components.quality,
-                },
+                reply,
+                {"direct": found.direct, "global": found.global_, "quality": found.quality},
             )
 
         return await asyncio.to_thread(result)
 
-    def _components(self, run: RunFolder) -> tuple[Components, dict[str, Any]]:
+    def _result_of(self, run: RunFolder) -> tuple[Result, dict[str, Any]]:
         """Of a run under way: so far; of one that has ended: as its products have it."""
         course = self._runner.course
         if course is not None and course.folder.id == run.id and not run.file.products:
-            components = course.result()
-            return components, components.facts
-        return products.read(run)
+            found = course.result()
+            return found, found.facts
+        measurement = measured.read(run)
+        return (measurement, measurement.facts) if measurement else products.read(run)
 
     async def _product(self, command: m.GetProduct, _: _Asked) -> Answer:
         def part() -> Answer:
@@ -285,7 +285,11 @@ class Commands:
                     m.Picture(facts={**glimpse.facts, "run": glimpse.run}), {"preview": small}
                 )
             run = self._runner.find("")
-            components, _ = self._components(run)
+            components, _ = self._result_of(run)
+            if not isinstance(components, Components):
+                raise UmbraError(
+                    Code.NO_RESULT, f"{run.id} measures: it has figures, no {command.what}"
+                )
             plane = components.direct if command.what == "direct" else components.global_
             shown = picture.component(plane, command.width)
             return Answer(

@@ -29,6 +29,7 @@ from protocol.results import (
     Part,
     Picture,
     Separation,
+    facts_of,
     message_of,
     part_of,
     picture_of,
@@ -172,6 +173,11 @@ class Commands:
     def result(self, run: str = "") -> Ask[Separation]:
         """Direct and global, final or so far."""
         return Ask(m.GetResult(run=run), separation_of, SLOW_S)
+
+    @command
+    def facts(self, run: str = "") -> Ask[dict[str, Any]]:
+        """The figures of a run, final or so far: of a separation quality.json's, else its own."""
+        return Ask(m.GetResult(run=run), facts_of, SLOW_S)
 
     @command
     def product_part(self, run: str, name: str, offset: int = 0, limit: int = 8 << 20) -> Ask[Part]:

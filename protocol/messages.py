@@ -335,6 +335,7 @@ class GetResult(Command, frozen=True, kw_only=True, tag="result"):
     """Direct and global as float32 arrays, at any time from the first frames on.
 
     Arrays: `direct`, `global` (H x W or H x W x 3, RGB, linear counts), `quality` (uint16 bits).
+    A run that measures (a calibration, a verification) is answered with its facts, and no arrays.
     """
 
     run: str = ""
@@ -541,7 +542,8 @@ class Runs(Reply, frozen=True, kw_only=True, tag="runs"):
 
 
 class Result(Reply, frozen=True, kw_only=True, tag="result"):
-    """Answer to `result`; final when the run is done. `facts` is quality.json's content so far."""
+    """Answer to `result`; final when the run is done. `facts` is the content so far of
+    quality.json, or the figures of a run that measures."""
 
     run: RunInfo
     final: bool

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import ClassVar
 
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import PatternMethod
+from daemon.scans.pattern_scan import RankedMethod
 from daemon.separation.estimator import Estimator
-from daemon.separation.extremes import MaxMin
 from protocol import patterns
 from protocol.scans import RandomBinary
 
 
-class RandomBinaryMethod(PatternMethod[RandomBinary]):
+class RandomBinaryMethod(RankedMethod[RandomBinary]):
     """Images in which patches are lit at random, each in the same number of them."""
 
     name: ClassVar[str] = "random-binary"
@@ -51,9 +50,4 @@ class RandomBinaryMethod(PatternMethod[RandomBinary]):
 
     def estimator(self) -> Estimator:
         """See `Method`."""
-        return MaxMin(
-            self.response,
-            lit_fraction=self.lit_fraction,
-            leakage=self.leakage,
-            average=self.spec.average,
-        )
+        return self.ranking()

@@ -14,6 +14,9 @@ from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
 
+_RESIDUAL = 0.02
+"""Part of the light by which a pattern and its complement may miss black and white together."""
+
 
 class ComplementPair:
     """Two images -> direct, global. Frames of pattern 0 and of its complement, pattern 1, are
@@ -93,7 +96,7 @@ class ComplementPair:
         ambient: Plane = black - whole * np.float32(b / (1.0 - b))
         return ambient, "black frame and the pair"
 
-    def _residual(self, first: Plane, second: Plane) -> dict[str, float]:
+    def _residual(self, first: Plane, second: Plane) -> dict[str, Any]:
         """Median of (P + I - W - K)/(W + K): not 0 for a wrong tone curve."""
         black = self._references.mean(Lighting.BLACK)
         white = self._references.mean(Lighting.WHITE)
@@ -102,7 +105,17 @@ class ComplementPair:
         whole = white + black
         bright = whole > 0.1 * float(np.max(whole))
         residual = (first + second - whole)[bright] / whole[bright]
-        return {"complement_residual": round(float(np.median(residual)), 5)}
+        found = round(float(np.median(residual)), 5)
+        return {
+            "complement_residual": found,
+            "advice": [
+                f"the two images together have {found:+.1%} of the light of black and white "
+                "together: the camera's tone curve is not the one given, or the source changed; "
+                "give the curve with --tone"
+            ]
+            if abs(found) > _RESIDUAL
+            else [],
+        }
 
     def summary(self) -> dict[str, float]:
         """Frames of both images, and those not used."""

@@ -82,6 +82,11 @@ class References:
         share = frames / (1.0 - leakage) ** 2
         return Total(whole, 0.0, share, "black and white frames")
 
+    def share(self, source: str) -> float:
+        """The variance of `ambient` for one frame's, to first order in the leakage."""
+        kind = Lighting.AMBIENT if source == "ambient frame" else Lighting.BLACK
+        return 1.0 / max(self.frames(kind), 1)
+
     def facts(self, ambient_from: str) -> dict[str, Any]:
         """Which reference frames there were and what ambient light was taken from."""
         frames = {kind.value: mean.frames for kind, mean in self._means.items()}

@@ -42,9 +42,14 @@ class ScanNoise:
         self._last = pattern, sample
 
     @property
+    def measured(self) -> bool:
+        """Whether it is measured, not an upper bound."""
+        return self._repeats.pairs > 0
+
+    @property
     def source(self) -> str:
         """From what the noise is known."""
-        return "repeated frames" if self._repeats.pairs else "one picture"
+        return "repeated frames" if self.measured else "one picture"
 
     def deviation(self, light: Plane) -> Plane:
         """Standard deviation of a pattern's averaged linear light at a level of it (float32)."""

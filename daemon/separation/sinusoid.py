@@ -87,7 +87,11 @@ class LeastSquares:
         if not ready or self._saturated is None:
             raise NotYet("a sinusoid needs 3 phases; they have not all come yet")
         noise = self._noise.noise()
-        solved = [self._separate(fit, noise) for fit in ready]
+        blur = self._blur(ready)
+        solved = [
+            self._separate(fit, noise, gain)
+            for fit, gain in zip(ready, self._gains(blur, len(ready)), strict=True)
+        ]
         direct, indirect, direct_var, global_var = _combine(solved)
         brightest = np.maximum.reduce([fit.brightest() for fit in ready])
         quality = np.zeros(direct.shape[:2], dtype=np.uint16)
@@ -103,6 +107,7 @@ class LeastSquares:
             "estimator": "lsq",
             "patterns": sum(fit.frames for fit in self._fits),
             "frequencies": len(ready),
+            "blur_px": None if blur is None else round(blur, 3),
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
@@ -137,7 +142,43 @@ class LeastSquares:
             "unused": float(self._unused),
         }
 
-    def _separate(self, fit: _Fit, noise: Noise | None) -> tuple[Plane, Plane, Plane, Plane]:
+    def _blur(self, ready: list[_Fit]) -> float | None:
+        """The blur of projector and camera together, in projector pixels; None from one period.
+
+        Blur of standard deviation s takes exp(-2π²s²f²) from a wave of frequency f, so the ratio of
+        two waves' amplitudes tells s. The median over the scene is taken: scattering within the
+        scene, which is global light, differs from place to place and stays in the amplitudes.
+        """
+        if len(ready) < 2 or len(ready) != len(self._periods):
+            return None
+        squares = self._squared_frequencies()
+        logs = []
+        first = None
+        for fit in ready:
+            _, cosine, sine = fit.solve()
+            power = (cosine * cosine + sine * sine)[::2, ::2]
+            first = power if first is None else first
+            bright = first > np.quantile(first, 0.5)
+            ratio = power[bright] / np.maximum(first[bright], np.float32(1e-12))
+            logs.append(0.5 * float(np.log(np.maximum(np.median(ratio), 1e-6))))
+        slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
+        return float(np.sqrt(max(-slope, 0.0) / (2.0 * np.pi**2)))
+
+    def _squared_frequencies(self) -> NDArray[np.float64]:
+        """Mean square of each wave's spatial frequency; its weave makes it higher along the other
+        axis."""
+        squares: NDArray[np.float64] = 1.0 / np.square(np.asarray(self._periods))
+        return squares * (1.0 + 0.5 * self._weave**2)
+
+    def _gains(self, blur: float | None, count: int) -> list[float]:
+        """What gives each wave its amplitude back."""
+        if not blur:
+            return [1.0] * count
+        return [float(g) for g in np.exp(2.0 * np.pi**2 * blur**2 * self._squared_frequencies())]
+
+    def _separate(
+        self, fit: _Fit, noise: Noise | None, gain: float
+    ) -> tuple[Plane, Plane, Plane, Plane]:
         """Direct, global and their variances from one frequency."""
         mean, cosine, sine = fit.solve()
         b = self._leakage
@@ -148,11 +189,11 @@ class LeastSquares:
             # |B| of noise alone is not 0: to first order its square is too large by one variance.
             power = np.maximum(power - np.float32(wave_var) * sigma * sigma, 0)
         amplitude: Plane = np.sqrt(power)
-        direct: Plane = amplitude * np.float32(2.0 / (1.0 - b))
+        direct: Plane = amplitude * np.float32(2.0 * gain / (1.0 - b))
         total = self._references.total(mean, b)
         indirect: Plane = total.light - direct
         variance = sigma * sigma
-        direct_var: Plane = variance * np.float32(wave_var * (2.0 / (1.0 - b)) ** 2)
+        direct_var: Plane = variance * np.float32(wave_var * (2.0 * gain / (1.0 - b)) ** 2)
         total_var: Plane = variance * np.float32(mean_var * total.of_half + total.of_frame)
         return direct, indirect, direct_var, direct_var + total_var
 

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.radiometry import Response
 from daemon.separation.sinusoid import LeastSquares
+from protocol.scans import Sinusoid as Spec
+from tests.daemon.scene import Scene
 
 FULL = 65535
 HEIGHT, WIDTH = 64, 96
@@ -191,3 +193,16 @@ def test_a_resumed_fit_gives_the_same_bits() -> None:
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
     for plane in one.planes:
         assert one.planes[plane].tobytes() == other.planes[plane].tobytes()
+
+
+def test_two_periods_give_back_what_blur_takes() -> None:
+    scene = Scene(blur=0.8, sigma=0.003)
+    one = scene.scan(Spec(phases=5, references=()))
+    two = scene.scan(Spec(phases=5, periods=(12.0, 20.0), references=()))
+    inside = np.s_[8:-8, 8:-8]
+    loss = float(np.median(one.direct[inside] / scene.direct[inside]))
+    left = float(np.median(two.direct[inside] / scene.direct[inside]))
+    assert loss < 0.96
+    assert left == pytest.approx(1.0, abs=0.015)
+    assert two.facts["blur_px"] == pytest.approx(0.8, abs=0.15)
+    assert ((two.quality & np.uint16(Quality.DISAGREE)) != 0).mean() < 0.01
