@@ -92,7 +92,8 @@ def test_what_is_attached_and_who_could_not_look(drivers: Daemon) -> None:
         with pytest.raises(UmbraError):
             rig.snap()  # the camera vanishes
         until(lambda: any(d.health is Health.LOST for d in rig.devices()))
-        searches = by_driver(rig.discover(*NAMES, "missing", "virtual", timeout_s=4.0))
+        others = (name for name in NAMES if name != "hangs")
+        searches = by_driver(rig.discover(*others, "missing", "virtual", timeout_s=30.0))
         [eye] = searches["good"].found
         assert (eye.model, eye.serial, eye.used_by) == ('Eye "2"', "007", "")
         assert tomllib.loads(eye.toml) == {
@@ -100,7 +101,8 @@ def test_what_is_attached_and_who_could_not_look(drivers: Daemon) -> None:
         }
         assert "# lens =" in eye.toml
         assert [f.used_by for f in searches["mine"].found] == ["camera"]
-        assert "nothing after 4 s" in searches["hangs"].problem
+        [late] = rig.discover("hangs", timeout_s=1.0)
+        assert "nothing after 1 s" in late.problem
         assert "terminate called" in searches["crashes"].problem
         assert "install the udev rules" in searches["refuses"].problem
         assert "pip install" in searches["missing"].problem
