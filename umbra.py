@@ -1,12 +1,50 @@
 """The face for notebooks: ``import umbra; rig = umbra.connect()``. Only hands names on."""
 
-from protocol.client import AsyncClient, Client, connect
-
+from protocol.aio import AsyncClient
+from protocol.client import Client, connect
 from protocol.errors import Code, UmbraError
 from protocol.patterns import BLACK, WHITE, Checker, Solid
-from protocol.scans import Checkerboard, Radiometry, Reference, Stick, TwoImage
+from protocol.scans import (
+    CalibrateDark,
+    CalibrateLatency,
+    CalibrateLeak,
+    CalibrateNoise,
+    CalibrateTone,
+    Checkerboard,
+    GrayCode,
+    Radiometry,
+    RandomBinary,
+    RandomPhase,
+    Reference,
+    SingleImage,
+    Sinusoid,
+    Stick,
+    TwoImage,
+)
 
 __all__ = [
-    "BLACK", "WHITE", "AsyncClient", "Checker", "Checkerboard", "Client", "Code", "Radiometry",
-    "Reference", "Solid", "Stick", "TwoImage", "UmbraError", "connect",
-]  # fmt: skip
+    "BLACK",
+    "WHITE",
+    "AsyncClient",
+    "CalibrateDark",
+    "CalibrateLatency",
+    "CalibrateLeak",
+    "CalibrateNoise",
+    "CalibrateTone",
+    "Checker",
+    "Checkerboard",
+    "Client",
+    "Code",
+    "GrayCode",
+    "Radiometry",
+    "RandomBinary",
+    "RandomPhase",
+    "Reference",
+    "SingleImage",
+    "Sinusoid",
+    "Solid",
+    "Stick",
+    "TwoImage",
+    "UmbraError",
+    "connect",
+]

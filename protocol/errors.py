@@ -32,6 +32,7 @@ class Code(enum.StrEnum):
     STORAGE_FAILED = "storage_failed"
     STOPPING = "stopping"  # the daemon is shutting down
     UNREACHABLE = "unreachable"  # made by the client: no answer from the daemon
+    BAD_KEYS = "bad_keys"  # a CURVE key file is missing, malformed, or readable by others
     INTERNAL = "internal"  # a bug; the daemon's log has the traceback
 
 

@@ -12,17 +12,29 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from protocol.patterns import Axis
+
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 Leak = Annotated[float, Meta(ge=0.0, lt=1.0)]
-LitFraction = Annotated[float, Meta(gt=0.0, le=1.0)]
+LitFraction = Annotated[float, Meta(gt=0.0, le=1.0, description="lit fraction α of the source")]
 Positive = Annotated[float, Meta(gt=0.0)]
+Checker = Annotated[int, Meta(ge=1, le=1024, description="side of a checker in projector pixels")]
 ToneCurve = Annotated[
     str,
     Meta(
         pattern=r"^(linear|srgb|gamma:[0-9]+(\.[0-9]+)?)$",
-        description="linear, srgb, or gamma:2.2 (the exponent that the camera encoded with)",
+        description="tone curve: linear, srgb, or gamma:2.2 (the exponent it was encoded with)",
     ),
 ]
+
+Period = Annotated[float, Meta(ge=2.0, le=65_536.0)]  # projector pixels
+Phases = Annotated[int, Meta(ge=3, le=1000, description="phases of each period, a whole turn")]
+Patch = Annotated[int, Meta(ge=1, le=1024, description="side of a patch in projector pixels")]
+Seed = Annotated[int, Meta(ge=0, le=2**53, description="of the random numbers")]
+
+AXIS = "axis along which the pattern varies: x makes vertical stripes"
+LEAKAGE = "brightness b of an unlit source element as a fraction of a lit one"
+ESTIMATOR = "how frames become components; maxmin is the paper's, auto the best for the method"
 
 
 class Reference(enum.StrEnum):
@@ -36,53 +48,188 @@ class Reference(enum.StrEnum):
 class Radiometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How camera counts become linear light. ``None`` means: as the rig is calibrated."""
 
-    black: Annotated[float, Meta(ge=0.0)] | None = None  # counts with no light at all
+    black: Annotated[float, Meta(ge=0.0, description="counts with no light at all")] | None = None
     tone: ToneCurve = "linear"  # undone before anything is computed
-    leakage: Leak | None = None  # b
-    saturation: Positive | None = None  # counts from which a sample is called saturated
+    leakage: Annotated[Leak, Meta(description=LEAKAGE)] | None = None
+    saturation: (
+        Annotated[Positive, Meta(description="counts from which a sample is called saturated")]
+        | None
+    ) = None
 
 
-class Scan(
+class Spec(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="method"
 ):
-    """What every scan can be told, whatever its method."""
+    """What every run can be told, whatever it is for."""
 
-    note: str = ""
-    exposure_us: Positive | None = None  # None: as the camera is set
-    gain: float | None = None
+    note: Annotated[str, Meta(description="what the run is for, kept with it")] = ""
+    exposure_us: Annotated[Positive, Meta(description="exposure of a frame in µs")] | None = None
+    gain: Annotated[float, Meta(description="of the camera, in its own unit")] | None = None
+
+
+class Scan(Spec, frozen=True, kw_only=True):
+    """What every scan that separates can be told."""
+
     radiometry: Radiometry = Radiometry()
-    #: frames taken before the patterns; None: black and white where the source can show them
-    references: tuple[Reference, ...] | None = None
+    #: None: black and white where the source can show them
+    references: (
+        Annotated[
+            tuple[Reference, ...],
+            Meta(description="frames to take before the patterns"),
+        ]
+        | None
+    ) = None
 
 
 class PatternScan(Scan, frozen=True, kw_only=True):
     """A scan of a fixed set of patterns."""
 
-    average: Count = 1  # frames averaged a pattern (the paper: 32)
-    lit_fraction: LitFraction | None = None  # α; None: the pattern's own
-    estimator: Literal["maxmin"] = "maxmin"
+    average: Annotated[Count, Meta(description="frames averaged a pattern (the paper: 32)")] = 1
+    lit_fraction: LitFraction | None = None  # None: the pattern's own
+    estimator: Annotated[Literal["auto", "maxmin", "topk", "lsq"], Meta(description=ESTIMATOR)] = (
+        "auto"
+    )
 
 
 class Checkerboard(PatternScan, frozen=True, kw_only=True, tag="checkerboard"):
     """Checkerboard shifts (§4.1): the paper's 25 images are 8 px checkers, 5 x 5 shifts of 3 px."""
 
-    checker: Annotated[int, Meta(ge=1, le=1024)] = 8
-    shift: Annotated[int, Meta(ge=1, le=1024)] = 3
-    shifts: Annotated[int, Meta(ge=2, le=64)] = 5  # in each direction
+    checker: Checker = 8
+    shift: Annotated[int, Meta(ge=1, le=1024, description="step from one to the next, px")] = 3
+    shifts: Annotated[int, Meta(ge=2, le=64, description="shifts in each direction")] = 5
 
 
 class TwoImage(PatternScan, frozen=True, kw_only=True, tag="two-image"):
     """A checkerboard and its complement (§3.3, Eq. 8)."""
 
-    checker: Annotated[int, Meta(ge=1, le=1024)] = 8
+    checker: Checker = 8
 
 
 class Stick(Scan, frozen=True, kw_only=True, tag="stick"):
     """A thin occluder swept over the scene on video (§4.2): α is close to 1, b = 0 in the umbra."""
 
     lit_fraction: LitFraction = 1.0
-    frames: Count | None = None  # None: to the end of the recording
-    estimator: Literal["maxmin"] = "maxmin"
+    frames: Annotated[Count, Meta(description="frames to take")] | None = None  # None: to the end
+    estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
 
 
-AnyScan = Checkerboard | TwoImage | Stick
+class Sinusoid(PatternScan, frozen=True, kw_only=True, tag="sinusoid"):
+    """sin(x + sin y) shifted along x (§4.3): N >= 3 phases of each period.
+
+    Several periods give as many independent separations, which are averaged and compared, and
+    (with no weave) an absolute projector coordinate. Frames come period by period.
+    """
+
+    periods: Annotated[
+        tuple[Period, ...],
+        Meta(min_length=1, max_length=16, description="periods in projector pixels"),
+    ] = (16.0,)
+    phases: Phases = 3
+    axis: Annotated[Axis, Meta(description=AXIS)] = Axis.X
+    weave: Annotated[
+        float, Meta(description="phase swing along the other axis, radians; 0: plain stripes")
+    ] = 1.0
+
+
+class RandomPhase(PatternScan, frozen=True, kw_only=True, tag="random-phase"):
+    """Each patch of projector pixels a sinusoid in time with a phase of its own (§4.3)."""
+
+    patch: Patch = 4
+    phases: Phases = 3
+    seed: Seed = 1
+
+
+class GrayCode(PatternScan, frozen=True, kw_only=True, tag="gray-code"):
+    """Gray code and its inverses (§4.3): direct and global from the finest stripes that each pixel
+    resolves, and the projector coordinate of each pixel. The coarsest bit comes first."""
+
+    axes: Annotated[
+        tuple[Axis, ...], Meta(min_length=1, max_length=2, description="coded axes: x, y or x,y")
+    ] = (Axis.X,)
+    bits: (
+        Annotated[int, Meta(ge=1, le=16, description="bits an axis (a recording's must be told)")]
+        | None
+    ) = None  # None: as many as the projector's size takes
+
+
+class RandomBinary(PatternScan, frozen=True, kw_only=True, tag="random-binary"):
+    """Random binary patterns in which each patch is lit equally often (§3.5)."""
+
+    patch: Patch = 6
+    patterns: Annotated[int, Meta(ge=2, le=1000, description="images")] = 20
+    seed: Seed = 1
+
+
+class SingleImage(PatternScan, frozen=True, kw_only=True, tag="single-image"):
+    """One image under fine stripes (§4.4): the peaks and valleys in a window across the stripes are
+    interpolated, and averaged over squares: components at 1/reduce of the camera's resolution."""
+
+    stripe: Annotated[int, Meta(ge=1, le=1024, description="width of a stripe, px")] = 2
+    axis: Annotated[Axis, Meta(description=AXIS)] = Axis.X
+    window: Annotated[int, Meta(ge=3, le=1001, description="n, camera px across stripes")] = 11
+    along: Annotated[int, Meta(ge=1, le=1001, description="m, camera px along stripes")] = 1
+    reduce: Annotated[int, Meta(ge=1, le=64, description="k, camera px averaged each way")] = 4
+    repeat: Annotated[Count, Meta(description="images, one after the other; live: many")] = 1
+
+
+class Measuring(Spec, frozen=True, kw_only=True):
+    """A run that measures the rig, or how well it separates: it ends in figures and plots."""
+
+
+class Calibration(Measuring, frozen=True, kw_only=True):
+    """A measurement that later runs apply by themselves, for as long as it is valid."""
+
+    @property
+    def kind(self) -> str:
+        """What it calibrates: dark, noise, leak, tone or latency."""
+        return str(self.__struct_config__.tag).removeprefix("calibrate-")
+
+
+Levels = Annotated[int, Meta(ge=3, le=256)]
+
+
+class CalibrateDark(Calibration, frozen=True, kw_only=True, tag="calibrate-dark"):
+    """Black level, read noise and hot pixels of the camera; put its lens cap on if it has one."""
+
+    exposures: Annotated[int, Meta(ge=2, le=32, description="exposure times, doubled from one to "
+                                   "the next up to the present one")] = 4  # fmt: skip
+    frames: Annotated[int, Meta(ge=2, le=1000, description="frames at each exposure")] = 8
+
+
+class CalibrateNoise(Calibration, frozen=True, kw_only=True, tag="calibrate-noise"):
+    """The camera's gain and noise by photon transfer: pairs of frames at several exposures."""
+
+    exposures: Annotated[int, Meta(ge=2, le=32, description="exposure times, evenly spread up to "
+                                   "the present one")] = 6  # fmt: skip
+    pairs: Annotated[int, Meta(ge=1, le=500, description="pairs of frames at each exposure")] = 4
+
+
+class CalibrateLeak(Calibration, frozen=True, kw_only=True, tag="calibrate-leak"):
+    """The projector's leakage b, and what lit and unlit patches of several sizes keep of it."""
+
+    sizes: Annotated[
+        tuple[Annotated[int, Meta(ge=1, le=256)], ...],
+        Meta(min_length=2, description="sides of the patches, projector px; largest: reference"),
+    ] = (1, 2, 3, 4, 6, 8, 12, 16)
+    average: Annotated[int, Meta(ge=2, le=1000, description="frames averaged a pattern")] = 2
+
+
+class CalibrateTone(Calibration, frozen=True, kw_only=True, tag="calibrate-tone"):
+    """The projector's response to its levels; patterns are then drawn so that light is linear."""
+
+    levels: Annotated[Levels, Meta(description="levels, evenly spread from black to white")] = 33
+    average: Annotated[Count, Meta(description="frames averaged a level")] = 2
+
+
+class CalibrateLatency(Calibration, frozen=True, kw_only=True, tag="calibrate-latency"):
+    """How much later than the driver says the projector's light changes, and its spread."""
+
+    longest_ms: Annotated[Positive, Meta(le=2000, description="delays up to this are found")] = 100
+    flashes: Annotated[int, Meta(ge=8, le=1000, description="flashes, their triggers spread")] = 48
+
+
+AnySeparation = (
+    Checkerboard | TwoImage | Stick | Sinusoid | RandomPhase | GrayCode | RandomBinary | SingleImage
+)
+AnyCalibration = CalibrateDark | CalibrateNoise | CalibrateLeak | CalibrateTone | CalibrateLatency
+AnyScan = AnySeparation | AnyCalibration

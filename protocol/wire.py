@@ -8,16 +8,17 @@ events             [topic, header, buffer...]
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from protocol.errors import Code, UmbraError
 from protocol.messages import ArrayHeader
 
-Arrays = Mapping[str, NDArray[Any]]
+if TYPE_CHECKING:  # NumPy is loaded with the first array: most commands carry none
+    from numpy.typing import NDArray
+
+Arrays: TypeAlias = "Mapping[str, NDArray[Any]]"
 T = TypeVar("T")
 
 _ALLOWED = {"uint8", "uint16", "float32", "bool"}
@@ -40,7 +41,7 @@ def encode(header: msgspec.Struct, arrays: Arrays | None = None) -> list[bytes |
     for name, a in (arrays or {}).items():
         if a.dtype.name not in _ALLOWED:
             raise ValueError(f"array {name}: the protocol does not carry {a.dtype}")
-        parts.append(np.ascontiguousarray(a).reshape(-1).view(np.uint8).data)
+        parts.append(a.reshape(-1).view("uint8").data)  # reshape copies what is not contiguous
     return parts
 
 
@@ -61,6 +62,10 @@ def arrays_of(
         raise UmbraError(
             Code.BAD_REQUEST, f"{len(announced)} arrays announced, {len(buffers)} sent", "$.arrays"
         )
+    if not announced:
+        return {}
+    import numpy as np  # noqa: PLC0415  (see above)
+
     found: dict[str, NDArray[Any]] = {}
     for i, (head, buffer) in enumerate(zip(announced, buffers, strict=True)):
         if head.dtype not in _ALLOWED or any(n < 0 for n in head.shape):

@@ -1,0 +1,261 @@
+"""umbrad: start-up, shutdown, and what the service manager is told.
+
+Start:  config -> store (held) -> sockets bound -> devices connected -> queue served -> READY=1
+Stop:   STOPPING=1 -> the run is interrupted -> devices safe and closed -> sockets closed -> 0
+
+Exit codes: 0 stopped as asked, 1 could not start or broke, 2 the configuration cannot be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import secrets
+import signal
+import sys
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+import structlog
+import zmq
+import zmq.asyncio
+
+from daemon import __version__, config, logs
+from daemon.access import Access, check_exposure
+from daemon.commands import Commands
+from daemon.manual import Manual
+from daemon.notify import Notifier
+from daemon.publisher import HIGH_WATER, Publisher
+from daemon.rig import Rig
+from daemon.runner import LOCK, Runner
+from daemon.server import Server
+from daemon.store import Store
+from daemon.viewfinder import Glimpse, Viewfinder
+from protocol.errors import UmbraError
+from protocol.messages import AnyEvent, DeviceChanged, PreviewTaken
+
+_TEND_S = 1.0
+_SWITCH_S = 0.0005
+"""Python's switch interval: commands must not wait 5 ms for a thread that computes."""
+
+log = structlog.get_logger(__name__)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The console script `umbrad`."""
+    parser = argparse.ArgumentParser(
+        prog="umbrad",
+        description="Drives a projector, a camera and an occluder, and separates light. "
+        "Without --config it is a virtual rig on loopback.",
+    )
+    parser.add_argument("--config", type=Path, metavar="rig.toml", help="the rig's description")
+    parser.add_argument("--check", action="store_true", help="check the configuration, and exit")
+    parser.add_argument("--log-level", default="info", choices=["debug", "info", "warning"])
+    parser.add_argument(
+        "--until-eof", action="store_true", help="stop when standard input is closed"
+    )
+    parser.add_argument("--version", action="version", version=f"umbrad {__version__}")
+    options = parser.parse_args(arguments)
+    try:
+        rig_config = config.load(options.config)
+        network = rig_config.network
+        check_exposure((network.command, network.events), network.keys)
+        if options.check:
+            print(f"{options.config or 'built-in'}: the configuration is good")
+            return 0
+        book = logs.configure(options.log_level)
+        sys.setswitchinterval(_SWITCH_S)
+        asyncio.run(_Daemon(rig_config, book).run(until_eof=options.until_eof))
+    except config.ConfigError as error:
+        print(f"umbrad: {error}", file=sys.stderr)
+        return 2
+    except (UmbraError, StartError) as error:
+        print(f"umbrad: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+class StartError(Exception):
+    """umbrad cannot start; the message is one line."""
+
+
+class _Daemon:
+    """The process: what is started here is stopped here, in the opposite order."""
+
+    def __init__(self, rig_config: config.RigConfig, book: logs.LogBook) -> None:
+        self._config = rig_config
+        self._book = book
+        self._notifier = Notifier()
+        self._stop = asyncio.Event()
+        self._reason = ""
+        self._tasks: list[asyncio.Task[None]] = []
+
+    async def run(self, *, until_eof: bool) -> None:
+        """Start, serve until asked to stop, stop. Raises UmbraError, ConfigError."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._ask_to_stop, number.name)
+        epoch = secrets.token_hex(6)
+        with contextlib.ExitStack() as stack:
+            store = stack.enter_context(
+                Store(Path(self._config.rig.data), self._config.storage.reserve_mb << 20)
+            )
+            context = zmq.asyncio.Context()
+            stack.callback(context.destroy, linger=0)
+            access = Access(context, self._config.network.keys)
+            access.start()
+            stack.callback(access.stop)
+            commands_socket = self._bind(context, zmq.ROUTER, access, self._config.network.command)
+            events_socket = self._bind(context, zmq.PUB, access, self._config.network.events)
+            publisher = Publisher(zmq.Socket.shadow(events_socket), epoch)
+
+            def publish(body: AnyEvent) -> None:
+                loop.call_soon_threadsafe(publisher.publish, body)
+
+            def glimpsed(glimpse: Glimpse) -> None:
+                body = PreviewTaken(run=glimpse.run, what="frame", facts=glimpse.facts)
+                loop.call_soon_threadsafe(lambda: publisher.publish(body, preview=glimpse.picture))
+
+            def changed() -> None:
+                loop.call_soon_threadsafe(commands.changed)
+
+            rig = Rig(self._config, lambda info: publish(DeviceChanged(device=info)))
+            viewfinder = Viewfinder(glimpsed)
+            manual = Manual(rig, viewfinder, changed, publish)
+            runner = Runner(
+                rig=rig,
+                store=store,
+                config=self._config,
+                viewfinder=viewfinder,
+                publish=publish,
+                on_activity=changed,
+                make_way=manual.make_way,
+            )
+            commands = Commands(
+                rig=rig,
+                runner=runner,
+                manual=manual,
+                store=store,
+                config=self._config,
+                viewfinder=viewfinder,
+                publisher=publisher,
+                book=self._book,
+                epoch=epoch,
+            )
+            runner.recover()
+            await asyncio.to_thread(rig.connect)
+            server = Server(commands_socket, commands.handle, access.caller)
+            self._serve(server.serve())
+            self._serve(runner.serve())
+            self._serve(self._tend(rig, manual, runner))
+            if (interval := self._notifier.watchdog_interval()) is not None:
+                self._serve(self._watch(interval, rig, runner))
+            if until_eof:
+                self._until_eof(loop)
+            self._notifier.ready(self._status_line(runner))
+            log.info(
+                "ready",
+                rig=self._config.rig.name,
+                version=__version__,
+                command=self._config.network.command,
+                events=self._config.network.events,
+                data=self._config.rig.data,
+            )
+            await self._stop.wait()
+            log.info("stopping", reason=self._reason)
+            self._notifier.stopping()
+            commands.stopping = True
+            commands.changed(self._reason)
+            await self._shut_down(rig, runner)
+        log.info("stopped")
+
+    async def _shut_down(self, rig: Rig, runner: Runner) -> None:
+        await runner.stop()
+        serving = self._tasks[1]
+        await asyncio.wait([serving])
+        await asyncio.to_thread(rig.close)
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    # ------------------------------------------------------------ pieces
+
+    def _bind(
+        self, context: zmq.asyncio.Context, kind: int, access: Access, endpoint: str
+    ) -> zmq.asyncio.Socket:
+        socket = context.socket(kind)
+        socket.linger = 0
+        if kind == zmq.PUB:
+            socket.sndhwm = HIGH_WATER
+        else:
+            socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        access.lock(socket)
+        try:
+            socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            raise StartError(
+                f"{endpoint}: {error.strerror or error}; is another umbrad running?"
+            ) from error
+        return socket
+
+    def _serve(self, work: Coroutine[Any, Any, None]) -> None:
+        """A task that must not end by itself: if it breaks, the daemon stops."""
+        task = asyncio.create_task(work)
+
+        def ended(done: asyncio.Task[None]) -> None:
+            if not done.cancelled() and done.exception() is not None:
+                log.error("a part of umbrad broke", exc_info=done.exception())
+                self._ask_to_stop("a part of umbrad broke")
+
+        task.add_done_callback(ended)
+        self._tasks.append(task)
+
+    async def _tend(self, rig: Rig, manual: Manual, runner: Runner) -> None:
+        told = ""
+        while True:
+            rig.tend()
+            manual.tend()
+            if manual.lock_info() is None:
+                runner.release(LOCK)
+            status = self._status_line(runner)
+            if status != told:
+                told = status
+                self._notifier.status(status)
+            await asyncio.sleep(_TEND_S)
+
+    async def _watch(self, interval: float, rig: Rig, runner: Runner) -> None:
+        """WATCHDOG=1 only while the loop (it is here) and every thread have beaten lately."""
+        while True:
+            if not rig.alive:
+                log.error("no watchdog beat: a device thread is stuck")
+            elif not runner.alive:
+                log.error("no watchdog beat: the run does not move")
+            else:
+                self._notifier.watchdog()
+            await asyncio.sleep(interval / 3)
+
+    def _status_line(self, runner: Runner) -> str:
+        progress = runner.progress
+        if progress is None:
+            return f"idle, {len(runner.queue())} queued"
+        share = "" if progress.fraction is None else f" {progress.fraction:.0%}"
+        return f"{progress.run}: {progress.phase}{share}"
+
+    def _ask_to_stop(self, reason: str) -> None:
+        self._reason = self._reason or reason
+        self._stop.set()
+
+    def _until_eof(self, loop: asyncio.AbstractEventLoop) -> None:
+        def readable() -> None:
+            if not os.read(sys.stdin.fileno(), 4096):
+                loop.remove_reader(sys.stdin)
+                self._ask_to_stop("standard input was closed")
+
+        loop.add_reader(sys.stdin, readable)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

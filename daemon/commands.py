@@ -1,0 +1,437 @@
+"""What each command does. One method a command; the protocol says what it means."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict
+from typing import Any, TypeVar
+
+import numpy as np
+
+from daemon import __version__, discovery, measured, picture, products
+from daemon.config import RigConfig
+from daemon.logs import LogBook
+from daemon.manual import Manual
+from daemon.publisher import Publisher
+from daemon.rig import SAFE_S, Rig
+from daemon.runner import LOCK, Runner
+from daemon.scans import catalog
+from daemon.separation.estimator import Components, Result
+from daemon.server import Answer, Caller
+from daemon.store import RunFolder, Store
+from daemon.viewfinder import Viewfinder, facts_of
+from drivers.base import CameraSettings as DriverSettings
+from drivers.base import PixelFormat
+from protocol import messages as m
+from protocol.errors import Code, UmbraError
+
+T = TypeVar("T")
+
+
+class Commands:
+    """Answers commands; called from the loop, what blocks goes to a worker thread."""
+
+    def __init__(
+        self,
+        *,
+        rig: Rig,
+        runner: Runner,
+        manual: Manual,
+        store: Store,
+        config: RigConfig,
+        viewfinder: Viewfinder,
+        publisher: Publisher,
+        book: LogBook,
+        epoch: str,
+    ) -> None:
+        self._rig = rig
+        self._runner = runner
+        self._manual = manual
+        self._store = store
+        self._config = config
+        self._viewfinder = viewfinder
+        self._publisher = publisher
+        self._book = book
+        self._epoch = epoch
+        self._began = time.monotonic()
+        self._estopped = False
+        self.stopping = False
+        self._table: dict[type[m.Command], Callable[[Any, _Asked], Awaitable[Answer]]] = {
+            m.Hello: self._hello,
+            m.GetStatus: self._status,
+            m.GetDevices: self._devices,
+            m.Discover: self._discover,
+            m.Submit: self._submit,
+            m.GetQueue: self._queue,
+            m.MoveQueued: self._move,
+            m.Pause: self._pause,
+            m.Resume: self._resume,
+            m.Abort: self._abort,
+            m.EStop: self._estop,
+            m.Reset: self._reset,
+            m.ListRuns: self._runs,
+            m.GetRun: self._run,
+            m.GetResult: self._result,
+            m.GetProduct: self._product,
+            m.GetLog: self._log,
+            m.GetPreview: self._preview,
+            m.Show: self._show,
+            m.Snap: self._snap,
+            m.SetCamera: self._camera,
+            m.SetLight: self._light,
+            m.GetStage: self._stage,
+            m.StageHome: self._stage_home,
+            m.StageMove: self._stage_move,
+            m.StageCircle: self._stage_circle,
+            m.StageStop: self._stage_stop,
+            m.StageUnlock: self._stage_unlock,
+            m.Dark: self._dark,
+            m.Lock: self._lock,
+            m.RenewLock: self._renew,
+            m.Unlock: self._unlock,
+        }
+
+    async def handle(
+        self, command: m.AnyCommand, caller: Caller, request_id: str, token: str
+    ) -> Answer:
+        """Do a command. Raises UmbraError or DeviceError."""
+        if self.stopping and command.role is m.Role.OPERATOR:
+            raise UmbraError(Code.STOPPING, "umbrad is shutting down; ask again when it is back")
+        return await self._table[type(command)](command, _Asked(caller, request_id, token))
+
+    @property
+    def state(self) -> m.RigState:
+        """What the rig as a whole is doing."""
+        if self.stopping:
+            return m.RigState.STOPPING
+        if self._estopped:
+            return m.RigState.ESTOPPED
+        if self._runner.current is not None:
+            return m.RigState.SCANNING
+        return m.RigState.MANUAL if self._manual.active else m.RigState.IDLE
+
+    # ------------------------------------------------------------ facts
+
+    async def _hello(self, _: m.Hello, asked: _Asked) -> Answer:
+        return Answer(
+            m.Welcome(
+                protocol=m.PROTOCOL,
+                server=__version__,
+                rig=self._config.rig.name,
+                epoch=self._epoch,
+                role=asked.caller.role,
+                events=self._config.network.events,
+                methods=catalog.NAMES,
+                devices=self._rig.names(),
+            )
+        )
+
+    async def _status(self, _: m.GetStatus, __: _Asked) -> Answer:
+        current = self._runner.current
+        return Answer(
+            m.Status(
+                rig=self._config.rig.name,
+                state=self.state,
+                epoch=self._epoch,
+                uptime_s=time.monotonic() - self._began,
+                devices=self._rig.devices(),
+                run=current.info() if current else None,
+                progress=self._runner.progress,
+                queue=tuple(run.info() for run in self._runner.queue()),
+                lock=self._manual.lock_info(),
+                free_bytes=self._store.free_bytes(),
+                reserve_bytes=self._store.reserve_bytes,
+                sequences=self._publisher.sequences(),
+            )
+        )
+
+    async def _devices(self, _: m.GetDevices, __: _Asked) -> Answer:
+        return Answer(m.Devices(devices=self._rig.devices()))
+
+    async def _discover(self, command: m.Discover, asked: _Asked) -> Answer:
+        self._manual.admit(asked.token)
+        self._require_no_run()
+        searches = await discovery.discover(
+            command.drivers, command.timeout_s, self._config.devices, self._rig.devices()
+        )
+        return Answer(m.Discovered(searches=searches))
+
+    async def _log(self, command: m.GetLog, _: _Asked) -> Answer:
+        return Answer(m.Log(records=self._book.records(command.run, command.limit)))
+
+    # ------------------------------------------------------------ runs
+
+    async def _submit(self, command: m.Submit, asked: _Asked) -> Answer:
+        self._manual.admit(asked.token)
+        if self._estopped:
+            raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
+        by = command.by or asked.caller.name
+        # Writing run.json takes an fsync: not in the loop.
+        run = await asyncio.to_thread(
+            self._runner.submit,
+            command.spec,
+            by,
+            asked.request_id,
+            first=command.first,
+            holder=self._manual.lock_info() is not None,
+        )
+        return _about(run)
+
+    async def _queue(self, _: m.GetQueue, __: _Asked) -> Answer:
+        return Answer(m.Runs(runs=tuple(run.info() for run in self._runner.queue())))
+
+    async def _move(self, command: m.MoveQueued, asked: _Asked) -> Answer:
+        self._manual.admit(asked.token)
+        queue = await asyncio.to_thread(self._runner.move, command.run, command.to)
+        return Answer(m.Runs(runs=tuple(run.info() for run in queue)))
+
+    async def _pause(self, command: m.Pause, asked: _Asked) -> Answer:
+        self._manual.admit(asked.token)
+        return _about(self._runner.pause(command.run))
+
+    async def _resume(self, command: m.Resume, asked: _Asked) -> Answer:
+        self._manual.admit(asked.token)
+        return _about(await asyncio.to_thread(self._runner.resume, command.run))
+
+    async def _abort(self, command: m.Abort, asked: _Asked) -> Answer:
+        by = command.by or asked.caller.name
+        return _about(await asyncio.to_thread(self._runner.abort, command.run, by))
+
+    async def _estop(self, command: m.EStop, asked: _Asked) -> Answer:
+        by = command.by or asked.caller.name
+        self._estopped = True
+        self._runner.hold("estop")
+        futures = self._rig.make_safe()
+        self._runner.end_for_estop(by)
+        safe = await asyncio.to_thread(self._rig.safe_within, futures, SAFE_S)
+        self.changed(f"emergency stop{f' by {by}' if by else ''}")
+        if not safe:
+            return Answer(
+                m.Done(message="stopped, but not every device said that it is safe: look at it")
+            )
+        return Answer(m.Done(message="stopped: dark and held; `umbra reset` ends it"))
+
+    async def _reset(self, _: m.Reset, __: _Asked) -> Answer:
+        await asyncio.to_thread(self._rig.require_ready)
+        self._estopped = False
+        self._runner.release("estop")
+        self.changed("reset")
+        return Answer(m.Done(message="the queue goes on"))
+
+    async def _runs(self, command: m.ListRuns, _: _Asked) -> Answer:
+        def listed() -> tuple[m.RunInfo, ...]:
+            chosen = [
+                run.info()
+                for run in self._store.runs()
+                if command.state is None or run.file.state is command.state
+            ]
+            return tuple(chosen[: command.limit])
+
+        return Answer(m.Runs(runs=await asyncio.to_thread(listed)))
+
+    async def _run(self, command: m.GetRun, _: _Asked) -> Answer:
+        return _about(await asyncio.to_thread(self._runner.find, command.run))
+
+    async def _result(self, command: m.GetResult, _: _Asked) -> Answer:
+        def result() -> Answer:
+            run = self._runner.find(command.run)
+            found, facts = self._result_of(run)
+            reply = m.Result(run=run.info(), final=run.file.state is m.RunState.DONE, facts=facts)
+            if not isinstance(found, Components):
+                return Answer(reply)
+            return Answer(
+                reply,
+                {"direct": found.direct, "global": found.global_, "quality": found.quality},
+            )
+
+        return await asyncio.to_thread(result)
+
+    def _result_of(self, run: RunFolder) -> tuple[Result, dict[str, Any]]:
+        """Of a run under way: so far; of one that has ended: as its products have it."""
+        course = self._runner.course
+        if course is not None and course.folder.id == run.id and not run.file.products:
+            found = course.result()
+            return found, found.facts
+        measurement = measured.read(run)
+        return (measurement, measurement.facts) if measurement else products.read(run)
+
+    async def _product(self, command: m.GetProduct, _: _Asked) -> Answer:
+        def part() -> Answer:
+            run = self._store.open(command.run)
+            path = run.product(command.name)
+            size = path.stat().st_size
+            with path.open("rb") as file:
+                file.seek(command.offset)
+                data = np.frombuffer(file.read(command.limit), np.uint8)
+            product = next(p for p in run.file.products if p.name == command.name)
+            return Answer(
+                m.ProductPart(product=product, offset=command.offset, size=size), {"data": data}
+            )
+
+        return await asyncio.to_thread(part)
+
+    async def _preview(self, command: m.GetPreview, _: _Asked) -> Answer:
+        def look() -> Answer:
+            if command.what == "frame":
+                glimpse = self._viewfinder.latest()
+                if glimpse is None:
+                    raise UmbraError(
+                        Code.NO_RESULT, "no frame has been taken yet; `umbra snap` takes one"
+                    )
+                small = picture.narrowed(glimpse.picture, command.width)
+                return Answer(
+                    m.Picture(facts={**glimpse.facts, "run": glimpse.run}), {"preview": small}
+                )
+            run = self._runner.find("")
+            components, _ = self._result_of(run)
+            if not isinstance(components, Components):
+                raise UmbraError(
+                    Code.NO_RESULT, f"{run.id} measures: it has figures, no {command.what}"
+                )
+            plane = components.direct if command.what == "direct" else components.global_
+            shown = picture.component(plane, command.width)
+            return Answer(
+                m.Picture(facts={"run": run.id, "what": command.what}), {"preview": shown}
+            )
+
+        return await asyncio.to_thread(look)
+
+    # ------------------------------------------------------------ by hand
+
+    async def _by_hand(self, asked: _Asked, act: Callable[[], T]) -> T:
+        self._manual.admit(asked.token)
+        if self._estopped:
+            raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
+        self._require_no_run()
+        return await asyncio.to_thread(act)
+
+    def _require_no_run(self) -> None:
+        current = self._runner.current
+        if current is not None:
+            raise UmbraError(
+                Code.BUSY,
+                f"{current.id} is using the devices; wait for it, or `umbra abort`",
+            )
+
+    async def _show(self, command: m.Show, asked: _Asked) -> Answer:
+        await self._by_hand(asked, lambda: self._manual.show(command.pattern, command.lease_s))
+        return Answer(
+            m.Done(message=f"shown; dark in {command.lease_s:g} s, or with `umbra show off`")
+        )
+
+    async def _snap(self, command: m.Snap, asked: _Asked) -> Answer:
+        def snap() -> Answer:
+            frame, info = self._manual.snap()
+            facts = facts_of(frame, info)
+            if not command.png:
+                return Answer(m.Picture(facts=facts), {"frame": frame.pixels})
+            shown = picture.png(frame.pixels, info.pixel_format, demosaiced=command.demosaic)
+            return Answer(m.Picture(facts=facts), {"png": shown})
+
+        return await self._by_hand(asked, snap)
+
+    async def _camera(self, command: m.SetCamera, asked: _Asked) -> Answer:
+        wanted = _settings(command.settings)
+        if wanted == DriverSettings():
+            in_force = self._rig.camera.device.settings()
+        else:
+            in_force = await self._by_hand(asked, lambda: self._manual.configure(wanted))
+        return Answer(m.Camera(settings=m.CameraSettings(**asdict(in_force))))
+
+    async def _light(self, command: m.SetLight, asked: _Asked) -> Answer:
+        await self._by_hand(asked, lambda: self._manual.light(command.name, command.on))
+        return Answer(m.Done(message=f"{command.name} is {'on' if command.on else 'off'}"))
+
+    async def _stage(self, _: m.GetStage, __: _Asked) -> Answer:
+        return Answer(await asyncio.to_thread(self._manual.stage.status))
+
+    async def _stage_home(self, command: m.StageHome, asked: _Asked) -> Answer:
+        home = self._manual.stage.home
+        return Answer(await self._by_hand(asked, lambda: home(command.timeout_s)))
+
+    async def _stage_move(self, command: m.StageMove, asked: _Asked) -> Answer:
+        def move() -> m.StageStatus:
+            return self._manual.stage.move(command.x_mm, command.y_mm, command.feed_mm_s)
+
+        return Answer(await self._by_hand(asked, move))
+
+    async def _stage_circle(self, command: m.StageCircle, asked: _Asked) -> Answer:
+        def circle() -> m.StageStatus:
+            return self._manual.stage.circle(
+                command.centre_mm, command.radius_mm, command.feed_mm_s, command.turns
+            )
+
+        return Answer(await self._by_hand(asked, circle))
+
+    async def _stage_stop(self, _: m.StageStop, __: _Asked) -> Answer:
+        """Whoever holds the rig: to stop is never refused, but a run is aborted, not stopped."""
+        self._require_no_run()
+        return Answer(await asyncio.to_thread(self._manual.stage.stop))
+
+    async def _stage_unlock(self, _: m.StageUnlock, asked: _Asked) -> Answer:
+        return Answer(await self._by_hand(asked, self._manual.stage.unlock))
+
+    async def _dark(self, _: m.Dark, asked: _Asked) -> Answer:
+        await self._by_hand(asked, self._manual.end)
+        return Answer(m.Done(message="dark"))
+
+    async def _lock(self, command: m.Lock, asked: _Asked) -> Answer:
+        token = await self._by_hand(
+            asked, lambda: self._manual.lock(command.owner, command.note, command.lease_s)
+        )
+        self._runner.hold(LOCK)
+        return Answer(m.Locked(token=token, lease_s=command.lease_s))
+
+    async def _renew(self, _: m.RenewLock, asked: _Asked) -> Answer:
+        return Answer(m.Locked(token=asked.token, lease_s=self._manual.renew(asked.token)))
+
+    async def _unlock(self, command: m.Unlock, asked: _Asked) -> Answer:
+        await asyncio.to_thread(self._manual.unlock, asked.token, force=command.force)
+        self._runner.release(LOCK)
+        return Answer(m.Done(message="the rig is free"))
+
+    # ------------------------------------------------------------ events
+
+    def changed(self, reason: str = "") -> None:
+        """Tell subscribers that the rig's state or lock changed; from the loop."""
+        self._publisher.publish(
+            m.RigChanged(state=self.state, lock=self._manual.lock_info(), reason=reason)
+        )
+
+
+class _Asked:
+    """Who asked, under which id, with which lock token."""
+
+    __slots__ = ("caller", "request_id", "token")
+
+    def __init__(self, caller: Caller, request_id: str, token: str) -> None:
+        self.caller = caller
+        self.request_id = request_id
+        self.token = token
+
+
+def _about(run: RunFolder) -> Answer:
+    return Answer(m.Run(run=run.info()))
+
+
+def _settings(wanted: m.CameraSettings) -> DriverSettings:
+    pixel_format = None
+    if wanted.pixel_format is not None:
+        try:
+            pixel_format = PixelFormat(wanted.pixel_format)
+        except ValueError:
+            known = ", ".join(PixelFormat)
+            raise UmbraError(
+                Code.BAD_REQUEST,
+                f"pixel format {wanted.pixel_format!r} is none of {known}",
+                "$.command.settings.pixel_format",
+            ) from None
+    return DriverSettings(
+        exposure_us=wanted.exposure_us,
+        gain=wanted.gain,
+        pixel_format=pixel_format,
+        frame_rate_hz=wanted.frame_rate_hz,
+        roi=wanted.roi,
+    )

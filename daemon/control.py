@@ -1,0 +1,64 @@
+"""What people ask of a run while it goes on: pause, resume, end. Thread-safe."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from daemon.devicethread import Session
+from protocol.messages import End, RunState
+
+
+class Control:
+    """Asked from the loop, obeyed by the sequencer between two steps.
+
+    running <──> paused;  either ──end──> ended (the session is revoked by the rig's safe state)
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._go = threading.Event()
+        self._go.set()
+        self._reason = ""
+        self._end: End | None = None
+
+    def pause(self, reason: str) -> None:
+        """Ask for a pause after the step under way."""
+        with self._lock:
+            self._reason = reason
+            self._go.clear()
+
+    def resume(self) -> None:
+        """Go on."""
+        self._go.set()
+
+    def end(self, state: RunState, reason: str, *, code: str = "", by: str = "") -> None:
+        """Say why the run must end; the first one to say so is remembered."""
+        with self._lock:
+            if self._end is None:
+                self._end = End(state=state, reason=reason, code=code, by=by)
+        self._go.set()
+
+    @property
+    def verdict(self) -> End | None:
+        """Why the run must end, if it must."""
+        return self._end
+
+    @property
+    def paused(self) -> bool:
+        """Whether a pause was asked for."""
+        return not self._go.is_set()
+
+    def checkpoint(self, session: Session, on_pause: Callable[[str], None]) -> bool:
+        """Between two steps: stay here while paused; True if there was a pause. Raises Revoked.
+
+        `on_pause` is called once, with the reason, before the wait.
+        """
+        session.check()
+        if self._go.is_set():
+            return False
+        on_pause(self._reason)
+        while not self._go.wait(0.25):
+            session.check()
+        session.check()
+        return True

@@ -1,0 +1,389 @@
+"""One run from its first step to its products, in a thread of its own.
+
+    prepare -> (replay what an interruption left) -> steps -> products -> end
+
+Everything between is the sequencer's and the recorder's; here it is decided what an end means:
+a failure keeps what was recorded, an abort leaves the devices safe, a full disk only pauses.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import structlog
+
+from daemon import products
+from daemon.calibration import Calibrations
+from daemon.config import RigConfig
+from daemon.control import Control
+from daemon.devicethread import Revoked, Session
+from daemon.failures import as_error
+from daemon.frames import FrameStore
+from daemon.recorder import Exposed, Recorder, Tally
+from daemon.rig import SAFE_S, Rig
+from daemon.ring import Ring
+from daemon.scans.catalog import method_for
+from daemon.scans.method import Method
+from daemon.separation.estimator import NotYet, Result
+from daemon.sequencer import CALL_S, Behind, Sequencer
+from daemon.store import RunFolder, Store, estimate_bytes
+from daemon.viewfinder import Viewfinder
+from drivers.base import CameraInfo, CameraSettings, DeviceError
+from drivers.clock import NS
+from protocol.errors import Code, UmbraError
+from protocol.messages import End, Progress, RunState
+from protocol.scans import Spec
+
+_PROGRESS_S = 0.1
+_ROOM_S = 1.0
+_RATE_FRAMES = 20
+_RESULT_S = 30.0
+_STILL_S = 60.0
+"""A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
+
+log = structlog.get_logger(__name__)
+
+
+def utc_now() -> str:
+    """This moment, as run.json has it."""
+    return datetime.now(UTC).isoformat(timespec="microseconds")
+
+
+class Course:
+    """The execution of one run. `execute` is its thread; all else may be called from any other."""
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        *,
+        rig: Rig,
+        store: Store,
+        config: RigConfig,
+        viewfinder: Viewfinder,
+        on_change: Callable[[], None],
+        on_progress: Callable[[Progress], None],
+    ) -> None:
+        self.folder = folder
+        self.control = Control()
+        self._rig = rig
+        self._store = store
+        self._config = config
+        self._viewfinder = viewfinder
+        self._on_change = on_change
+        self._on_progress = on_progress
+        self._recorder: Recorder | None = None
+        self._method: Method[Any] | None = None
+        self._phase = "preparing"
+        self._moments: deque[tuple[int, int]] = deque(maxlen=_RATE_FRAMES + 1)
+        self._told = 0.0
+        self._room_seen = 0.0
+        self._timings: dict[str, float] = {}
+        self._exposure_s = 0.0
+        self.beat = time.monotonic()
+
+    # ------------------------------------------------------------ for others
+
+    def progress(self) -> Progress:
+        """How far it is, now."""
+        recorder, method = self._recorder, self._method
+        tally = recorder.tally if recorder else Tally()
+        summary = dict(recorder.summary) if recorder else {}
+        planned = method.planned() if method else None
+        fraction = summary.get("coverage") if planned is None else tally.taken / max(planned, 1)
+        rate = self._rate()
+        left = None if planned is None or not rate else max(0, planned - tally.taken) / rate
+        return Progress(
+            run=self.folder.id,
+            state=self.folder.file.state,
+            recorded=tally.recorded,
+            planned=planned,
+            missing=tally.missing,
+            rejected=tally.rejected,
+            fraction=fraction,
+            rate_hz=rate,
+            remaining_s=left,
+            phase=self._phase,
+            summary=summary,
+        )
+
+    def result(self) -> Result:
+        """The result from the frames so far. Raises UmbraError(no_result)."""
+        recorder = self._recorder
+        if recorder is None:
+            raise UmbraError(Code.NO_RESULT, f"{self.folder.id} has no frames yet")
+        try:
+            return recorder.result(_RESULT_S)
+        except NotYet as error:
+            raise UmbraError(Code.NO_RESULT, str(error)) from error
+
+    @property
+    def alive(self) -> bool:
+        """Whether it has moved lately; a pause, and the making of products, count as moving."""
+        at_rest = self.control.paused or self.folder.file.state is not RunState.RUNNING
+        return at_rest or time.monotonic() - self.beat < _STILL_S + 2 * self._exposure_s
+
+    def _rate(self) -> float:
+        moments = list(self._moments)
+        if len(moments) < 2 or moments[-1][0] == moments[0][0]:
+            return 0.0
+        return (moments[-1][1] - moments[0][1]) / (moments[-1][0] - moments[0][0]) * NS
+
+    # ------------------------------------------------------------ the thread
+
+    def execute(self) -> End:
+        """Run to the end; never raises. The devices are safe when it returns."""
+        structlog.contextvars.bind_contextvars(run=self.folder.id)
+        session: Session | None = None
+        try:
+            session = self._rig.take(f"run {self.folder.id}")
+            end = self._execute(session)
+        except Revoked:
+            end = self.control.verdict or End(
+                state=RunState.INTERRUPTED, reason="the devices were taken away"
+            )
+        except Exception as error:
+            if isinstance(error, DeviceError):
+                self._rig.failed(error)
+            known = as_error(error)
+            if known.code is Code.INTERNAL:
+                log.exception("run failed")
+            end = self.control.verdict or End(
+                state=RunState.FAILED, reason=known.message, code=known.code
+            )
+        finally:
+            if session is not None:
+                # Whoever revoked the session has sent the devices there already: this waits.
+                futures = self._rig.make_safe(halt=not session.ended.is_set())
+                self._rig.safe_within(futures, SAFE_S)
+                self._rig.leave(session)
+        self._close(end)
+        return end
+
+    def _execute(self, session: Session) -> End:
+        began = time.monotonic()
+        file = self.folder.file
+        resuming = bool(file.started)
+        if resuming:
+            self._same_devices(file.rig)
+        settings = self._configure(session, file.spec, file.rig if resuming else None)
+        calibration = file.calibration if resuming else None
+        if calibration is None:
+            found = Calibrations(self._store, self._config.calibration.max_age_days)
+            calibration = found.of(self._rig.snapshot(), settings, file.spec)
+        bench = self._rig.bench(calibration["values"])
+        method = self._method = method_for(file.spec, bench)
+        info = bench.camera
+        self._room(method.planned(), info)
+        self._update(
+            state=RunState.RUNNING,
+            started=file.started or utc_now(),
+            ended="",
+            end=None,
+            planned=method.planned(),
+            rig={**self._rig.snapshot(), "settings": settings},
+            calibration=calibration,
+        )
+        frames = self._frames(info, resuming)
+        try:
+            ring = Ring(self._config.sequencer.ring_frames, info.shape, info.pixel_format.dtype)
+            recorder = self._recorder = Recorder(method, frames, ring, self._taken)
+            step, sub = self._replay(recorder, resuming)
+            recorder.start()
+            self._say("scanning")
+            self._timings["prepare_s"] = time.monotonic() - began
+            scanning = self._rig.clock.now_ns()
+            try:
+                self._sequence(session, method, recorder, ring, (step, sub))
+            finally:
+                # Also after an abort: what the camera gave is made durable and counted.
+                recorder.finish()
+                self._count(recorder.tally)
+            self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
+            truth = self._rig.camera.call(lambda c: c.truth(), CALL_S, session)
+            self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
+            return self._conclude(recorder, info, truth)
+        finally:
+            frames.close()
+
+    def _sequence(
+        self,
+        session: Session,
+        method: Method[Any],
+        recorder: Recorder,
+        ring: Ring,
+        start: tuple[int, int],
+    ) -> None:
+        try:
+            Sequencer(
+                rig=self._rig,
+                session=session,
+                control=self.control,
+                method=method,
+                recorder=recorder,
+                ring=ring,
+                patience=self._config.sequencer,
+                may_go_on=self._may_go_on,
+                on_pause=self._paused,
+            ).run(*start, taken=recorder.tally.taken)
+        except Behind as error:
+            raise UmbraError(
+                Code.STORAGE_FAILED,
+                f"{self._config.rig.data}: the disk has not taken a frame for half a minute; "
+                "check it, then `umbra resume`",
+            ) from error
+
+    # ------------------------------------------------------------ before
+
+    def _configure(
+        self, session: Session, spec: Spec, before: Mapping[str, Any] | None
+    ) -> dict[str, Any]:
+        """Set the camera as the spec asks, or exactly as it was before an interruption."""
+        wanted = CameraSettings(exposure_us=spec.exposure_us, gain=spec.gain)
+        if before is not None and (known := before.get("settings")):
+            wanted = CameraSettings(exposure_us=known["exposure_us"], gain=known["gain"])
+        camera = self._rig.camera
+        in_force = camera.call(lambda c: c.configure(wanted), CALL_S, session)
+        self._exposure_s = (in_force.exposure_us or 0.0) * 1e-6
+        return {
+            "exposure_us": in_force.exposure_us,
+            "gain": in_force.gain,
+            "pixel_format": camera.device.info().pixel_format.value,
+        }
+
+    def _same_devices(self, before: Mapping[str, Any]) -> None:
+        """An interrupted run goes on with the devices that it began with, or not at all."""
+        for name, now in self._rig.snapshot().items():
+            then = before.get(name)
+            if then is None or (then["model"], then["serial"]) != (now["model"], now["serial"]):
+                raise UmbraError(
+                    Code.UNSUITABLE,
+                    f"{self.folder.id} cannot be resumed: its {name} was "
+                    f"{then and then['model']} {then and then['serial']}, "
+                    f"now it is {now['model']} {now['serial']}; scan again",
+                )
+
+    def _room(self, planned: int | None, info: CameraInfo) -> None:
+        need = estimate_bytes(
+            info.shape, info.pixel_format.dtype, planned or 1, self._config.storage.keep_frames
+        )
+        if not self._store.room_for(need):
+            raise UmbraError(
+                Code.STORAGE_FULL,
+                f"{self._config.rig.data}: the scan needs about {need / 1e6:.0f} MB beyond the "
+                f"reserve, {self._store.free_bytes() / 1e6:.0f} MB are free: delete old runs",
+            )
+
+    def _frames(self, info: CameraInfo, resuming: bool) -> FrameStore:
+        if resuming and (self.folder.path / "frames.jsonl").exists():
+            return FrameStore.open(self.folder.path)
+        return FrameStore.create(
+            self.folder.path,
+            info.shape,
+            info.pixel_format.dtype,
+            pixels=self._config.storage.keep_frames,
+        )
+
+    def _replay(self, recorder: Recorder, resuming: bool) -> tuple[int, int]:
+        if not resuming:
+            return 0, 0
+        self._say("taking in what was recorded before the interruption")
+        step, sub = recorder.replay()
+        log.info("resumed", step=step, sub=sub, recorded=recorder.tally.recorded)
+        return step, sub
+
+    # ------------------------------------------------------------ during
+
+    def _may_go_on(self) -> None:
+        """Called at each step: a sign of life, and a pause before the disk is full."""
+        self.beat = time.monotonic()
+        if self.beat - self._room_seen < _ROOM_S:
+            return
+        self._room_seen = self.beat
+        if not self.control.paused and not self._store.room_for(0):
+            self.control.pause(
+                f"only {self._store.free_bytes() / 1e6:.0f} MB are free in "
+                f"{self._config.rig.data}, less than the reserve: free some, then `umbra resume`"
+            )
+
+    def _paused(self, reason: str) -> None:
+        """The sequencer has stopped at a checkpoint; comes back when it may go on."""
+        log.info("paused", reason=reason)
+        self._say(f"paused: {reason}" if reason else "paused")
+        self._update(state=RunState.PAUSED)
+
+    def resumed(self) -> None:
+        """The pause is over."""
+        self.control.resume()
+        if self.folder.file.state is RunState.PAUSED:
+            self._moments.clear()
+            self._update(state=RunState.RUNNING)
+            self._say("scanning")
+
+    def _taken(self, tally: Tally, summary: Mapping[str, float], exposed: Exposed) -> None:
+        """The estimator has taken a frame in (separator's thread)."""
+        del summary
+        now = time.monotonic()
+        self.beat = now
+        self._moments.append((self._rig.clock.now_ns(), tally.taken))
+        if exposed.frame is not None:
+            self._viewfinder.offer(exposed.frame, self._rig.camera.device.info(), self.folder.id)
+        if now - self._told >= _PROGRESS_S or tally.taken == self.folder.file.planned:
+            self._told = now
+            self._on_progress(self.progress())
+
+    def _say(self, phase: str) -> None:
+        self._phase = phase
+        self._on_progress(self.progress())
+
+    def _update(self, **changes: Any) -> None:
+        self.folder.update(**changes)
+        self._on_change()
+
+    def _count(self, tally: Tally) -> None:
+        self.folder.update(recorded=tally.recorded, missing=tally.missing, rejected=tally.rejected)
+
+    # ------------------------------------------------------------ after
+
+    def _conclude(self, recorder: Recorder, info: CameraInfo, truth: Mapping[str, Any]) -> End:
+        self._update(state=RunState.FINISHING)
+        self._say("writing products")
+        began = time.monotonic()
+        result = recorder.result(_RESULT_S)
+        self._timings["separate_s"] = time.monotonic() - began
+        lost = recorder.lost_patterns
+        made = products.write(
+            self.folder,
+            result,
+            full_scale=info.pixel_format.full_scale,
+            pixel_format=info.pixel_format,
+            frame=self._viewfinder.picture(),
+            truth=truth,
+            timings={**self._timings, "rate_hz": self._rate()},
+        )
+        self.folder.add_products(made)
+        self._timings["products_s"] = time.monotonic() - began
+        if lost:
+            return End(
+                state=RunState.FAILED,
+                code=Code.FRAMES_MISSING,
+                reason=f"no frame could be had of {len(lost)} of the patterns "
+                f"({', '.join(str(n) for n in lost[:8])}{' ...' if len(lost) > 8 else ''}); "
+                "the products are made without them",
+            )
+        return End(state=RunState.DONE, reason="all steps were exposed")
+
+    def _close(self, end: End) -> None:
+        try:
+            self.folder.update(
+                state=end.state, end=end, ended=utc_now(), timings=dict(self._timings)
+            )
+        except (OSError, UmbraError):
+            # The disk refuses even this: after a restart the run is `interrupted`, which is true.
+            log.exception("the run's end could not be written")
+        say = log.info if end.state is RunState.DONE else log.warning
+        say("run " + end.state, reason=end.reason, code=end.code, by=end.by)
+        self._on_change()

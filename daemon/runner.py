@@ -1,0 +1,305 @@
+"""The queue, and the life of a run: which one is next, and what people may do to it.
+
+All methods are called from the loop; the course of the current run is a thread of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+
+import structlog
+
+from daemon.config import RigConfig
+from daemon.course import Course, utc_now
+from daemon.failures import as_error
+from daemon.rig import Rig
+from daemon.scans.catalog import method_for
+from daemon.scans.method import Unsuitable
+from daemon.store import RunFolder, Store
+from daemon.viewfinder import Viewfinder
+from protocol.errors import Code, UmbraError
+from protocol.messages import (
+    AnyEvent,
+    End,
+    Progress,
+    Progressed,
+    QueueChanged,
+    RunChanged,
+    RunState,
+)
+from protocol.scans import AnyScan
+
+_UNFINISHED = {RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}
+_RESUMABLE_CODES = {
+    Code.DEVICE_LOST,
+    Code.DEVICE_TIMEOUT,
+    Code.DEVICE_REFUSED,
+    Code.DEVICE_GARBLED,
+    Code.STORAGE_FULL,
+    Code.STORAGE_FAILED,
+}
+
+LOCK = "lock"
+"""A reason to hold the queue, except for runs of whoever holds the rig."""
+
+log = structlog.get_logger(__name__)
+
+
+class Runner:
+    """Runs what is queued, one at a time, in order; everything it knows is in the store."""
+
+    def __init__(
+        self,
+        *,
+        rig: Rig,
+        store: Store,
+        config: RigConfig,
+        viewfinder: Viewfinder,
+        publish: Callable[[AnyEvent], None],
+        on_activity: Callable[[], None],
+        make_way: Callable[[], None],
+    ) -> None:
+        """`publish` and `on_activity` must be safe to call from any thread; `make_way` ends manual
+        work before a run and may block."""
+        self._rig = rig
+        self._store = store
+        self._config = config
+        self._viewfinder = viewfinder
+        self._publish = publish
+        self._on_activity = on_activity
+        self._make_way = make_way
+        self._course: Course | None = None
+        self._wake = asyncio.Event()
+        self._held: set[str] = set()
+        self._of_holder: set[str] = set()  # runs submitted by whoever holds the rig
+        self._stopping = False
+
+    # ------------------------------------------------------------ the loop
+
+    def recover(self) -> None:
+        """After a start: runs that were under way were interrupted, whatever ended the daemon."""
+        for run in self._store.runs():
+            if run.file.state in _UNFINISHED:
+                reason = "umbrad ended while the run was under way; `umbra resume` goes on with it"
+                run.update(
+                    state=RunState.INTERRUPTED,
+                    ended=utc_now(),
+                    end=End(state=RunState.INTERRUPTED, reason=reason),
+                )
+                log.warning("run interrupted", run=run.id)
+
+    async def serve(self) -> None:
+        """Run what is queued until `stop`."""
+        while not self._stopping:
+            run = self._next()
+            if run is None:
+                self._wake.clear()
+                await self._wake.wait()
+                continue
+            await self._run(run)
+
+    def _next(self) -> RunFolder | None:
+        if self._stopping or self._held - {LOCK}:
+            return None
+        waiting = self._store.queued()
+        if LOCK in self._held:
+            waiting = [run for run in waiting if run.id in self._of_holder]
+        return next(iter(waiting), None)
+
+    async def _run(self, run: RunFolder) -> None:
+        loop = asyncio.get_running_loop()
+        ended = loop.create_future()
+        course = self._course = Course(
+            run,
+            rig=self._rig,
+            store=self._store,
+            config=self._config,
+            viewfinder=self._viewfinder,
+            on_change=lambda: self._publish(RunChanged(run=run.info())),
+            on_progress=lambda p: self._publish(Progressed(progress=p)),
+        )
+
+        def execute() -> None:
+            course.execute()
+            loop.call_soon_threadsafe(ended.set_result, None)
+
+        self._on_activity()
+        log.info("run begins", run=run.id)
+        await asyncio.to_thread(self._make_way)
+        thread = threading.Thread(target=execute, name="umbra-sequencer")
+        thread.start()
+        await ended
+        thread.join()
+        self._course = None
+        self._publish(QueueChanged(queue=tuple(r.id for r in self._store.queued())))
+        self._on_activity()
+
+    async def stop(self) -> None:
+        """For shutdown: the current run is interrupted, and can be resumed after a restart."""
+        self._stopping = True
+        course = self._course
+        if course is not None:
+            course.control.end(RunState.INTERRUPTED, "umbrad was stopped; `umbra resume` goes on")
+            self._rig.make_safe()
+        self._wake.set()
+
+    def hold(self, why: str) -> None:
+        """Begin no run for as long as `why` is not released; during a LOCK only its holder's."""
+        self._held.add(why)
+
+    def release(self, why: str) -> None:
+        """The reason to hold is gone."""
+        self._held.discard(why)
+        if why == LOCK:
+            self._of_holder.clear()
+        self._wake.set()
+
+    def end_for_estop(self, by: str) -> None:
+        """The devices have been stopped: the current run ends as aborted."""
+        if self._course is not None:
+            self._course.control.end(RunState.ABORTED, "emergency stop", by=by)
+
+    # ------------------------------------------------------------ what is going on
+
+    @property
+    def alive(self) -> bool:
+        """Whether the run under way, if any, has moved lately (the watchdog's question)."""
+        return self._active is None or self._active.alive
+
+    @property
+    def current(self) -> RunFolder | None:
+        """The run under way."""
+        return self._active.folder if self._active else None
+
+    @property
+    def _active(self) -> Course | None:
+        """The course, unless its run has ended and only the loop has not heard of it yet."""
+        course = self._course
+        return None if course is None or course.folder.file.state.ended else course
+
+    @property
+    def course(self) -> Course | None:
+        """The course of the run under way."""
+        return self._active
+
+    @property
+    def progress(self) -> Progress | None:
+        """How far the run under way is."""
+        return self._active.progress() if self._active else None
+
+    def queue(self) -> list[RunFolder]:
+        """The runs that wait, the next first."""
+        return self._store.queued()
+
+    def find(self, run: str) -> RunFolder:
+        """A run by its id; "" is the current, else the newest. Raises UmbraError(unknown_run)."""
+        if run:
+            return self._store.open(run)
+        if self._active is not None:
+            return self._active.folder
+        newest = next(iter(self._store.runs()), None)
+        if newest is None:
+            raise UmbraError(Code.UNKNOWN_RUN, "there is no run yet; `umbra scan` makes one")
+        return newest
+
+    # ------------------------------------------------------------ commands
+
+    def submit(
+        self, spec: AnyScan, by: str, request_id: str, *, first: bool, holder: bool
+    ) -> RunFolder:
+        """Queue a scan, durably. Raises UmbraError when the rig cannot do it as it is now.
+
+        Safe to repeat with the same `request_id`, also after a restart.
+        """
+        if (known := self._store.find_request(request_id)) is not None:
+            return known
+        try:
+            method_for(spec, self._rig.bench())
+        except Unsuitable as error:
+            raise as_error(error) from error
+        run = self._store.create(
+            spec, self._rig.snapshot(), by=by, request_id=request_id, first=first
+        )
+        if holder:
+            self._of_holder.add(run.id)
+        log.info("run queued", run=run.id, by=by)
+        self._queue_changed(run)
+        return run
+
+    def move(self, run: str, to: int) -> list[RunFolder]:
+        """Put a waiting run at another place; gives the new queue."""
+        moved = self._waiting(run)
+        rest = [r for r in self._store.queued() if r.id != moved.id]
+        rest.insert(min(to, len(rest)), moved)
+        for order, waiting in enumerate(rest):
+            if waiting.file.order != order:
+                waiting.update(order=order)
+        self._publish(QueueChanged(queue=tuple(r.id for r in rest)))
+        return rest
+
+    def pause(self, run: str) -> RunFolder:
+        """Pause the current run after the step under way."""
+        course = self._running(run)
+        if course.folder.file.state is not RunState.RUNNING:
+            raise self._wrong_state(course.folder, "paused")
+        course.control.pause("asked for by an operator")
+        return course.folder
+
+    def resume(self, run: str) -> RunFolder:
+        """Go on with the paused run, or queue an interrupted one again, ahead of the others."""
+        course = self._active
+        if not run and course is None:
+            raise UmbraError(
+                Code.WRONG_STATE, "no run is paused; name the interrupted one: `umbra resume RUN`"
+            )
+        folder = self.find(run)
+        if course is not None and folder.id == course.folder.id:
+            course.resumed()
+            return folder
+        file = folder.file
+        broke = file.state is RunState.FAILED and file.end and file.end.code in _RESUMABLE_CODES
+        if file.state is not RunState.INTERRUPTED and not broke:
+            raise self._wrong_state(folder, "resumed")
+        orders = [r.file.order for r in self._store.queued()] or [0]
+        folder.update(state=RunState.QUEUED, order=min(orders) - 1)
+        self._queue_changed(folder)
+        return folder
+
+    def abort(self, run: str, by: str) -> RunFolder:
+        """End a run that waits, runs or is paused; the devices go to their safe state at once."""
+        course = self._active
+        if course is not None and run in {"", course.folder.id}:
+            course.control.end(RunState.ABORTED, "aborted", by=by)
+            self._rig.make_safe()
+            return course.folder
+        if not run:
+            raise UmbraError(Code.WRONG_STATE, "no run is under way; name the one: `umbra queue`")
+        waiting = self._waiting(run)
+        end = End(state=RunState.ABORTED, reason="taken from the queue", by=by)
+        waiting.update(state=RunState.ABORTED, end=end, ended=utc_now())
+        self._queue_changed(waiting)
+        return waiting
+
+    def _running(self, run: str) -> Course:
+        course = self._active
+        if course is None or run not in {"", course.folder.id}:
+            if run:
+                raise self._wrong_state(self._store.open(run), "paused")
+            raise UmbraError(Code.WRONG_STATE, "no run is under way")
+        return course
+
+    def _waiting(self, run: str) -> RunFolder:
+        folder = self._store.open(run)
+        if folder.file.state is not RunState.QUEUED:
+            raise self._wrong_state(folder, "moved or taken from the queue")
+        return folder
+
+    def _wrong_state(self, run: RunFolder, done: str) -> UmbraError:
+        return UmbraError(Code.WRONG_STATE, f"{run.id} is {run.file.state}: it cannot be {done}")
+
+    def _queue_changed(self, run: RunFolder) -> None:
+        self._publish(RunChanged(run=run.info()))
+        self._publish(QueueChanged(queue=tuple(r.id for r in self._store.queued())))
+        self._wake.set()

@@ -1,0 +1,63 @@
+"""Which method does which scan."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from daemon.scans.calibrate_dark import DarkMethod
+from daemon.scans.calibrate_latency import LatencyMethod
+from daemon.scans.calibrate_leak import LeakMethod
+from daemon.scans.calibrate_noise import NoiseMethod
+from daemon.scans.calibrate_tone import ToneMethod
+from daemon.scans.checkerboard import CheckerboardMethod
+from daemon.scans.gray_code import GrayCodeMethod
+from daemon.scans.method import Bench, Method, Unsuitable
+from daemon.scans.random_binary import RandomBinaryMethod
+from daemon.scans.single_image import SingleImageMethod
+from daemon.scans.sinusoid import RandomPhaseMethod, SinusoidMethod
+from daemon.scans.stick import StickMethod
+from daemon.scans.two_image import TwoImageMethod
+from protocol.scans import (
+    AnyScan,
+    CalibrateDark,
+    CalibrateLatency,
+    CalibrateLeak,
+    CalibrateNoise,
+    CalibrateTone,
+    Checkerboard,
+    GrayCode,
+    RandomBinary,
+    RandomPhase,
+    SingleImage,
+    Sinusoid,
+    Stick,
+    TwoImage,
+)
+
+_METHODS: dict[type[AnyScan], type[Method[Any]]] = {
+    Checkerboard: CheckerboardMethod,
+    TwoImage: TwoImageMethod,
+    Stick: StickMethod,
+    Sinusoid: SinusoidMethod,
+    RandomPhase: RandomPhaseMethod,
+    GrayCode: GrayCodeMethod,
+    RandomBinary: RandomBinaryMethod,
+    SingleImage: SingleImageMethod,
+    CalibrateDark: DarkMethod,
+    CalibrateNoise: NoiseMethod,
+    CalibrateLeak: LeakMethod,
+    CalibrateTone: ToneMethod,
+    CalibrateLatency: LatencyMethod,
+}
+
+NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())
+"""The methods' names, as they travel."""
+
+
+def method_for(spec: AnyScan, bench: Bench) -> Method[Any]:
+    """The method of a scan, checked against the rig. Raises Unsuitable."""
+    try:
+        made = _METHODS[type(spec)]
+    except KeyError:
+        raise Unsuitable(f"no method does {type(spec).__name__}") from None
+    return made(spec, bench)

@@ -1,0 +1,286 @@
+"""Separation under a moving occluder, and whether its shadow ever reached a pixel (§4.2).
+
+L_max and L_min say nothing of a pixel that the shadow never crossed: its minimum is its own noise,
+and direct = 0 would be a lie. The frames tell it from a pixel that the source never reaches, whose
+direct light *is* 0:
+
+- *drop*: L_max - L_min beyond what noise does over that many frames and beyond the part of the
+  light that comes and goes with the rest of the scene. Seen: the shadow was here.
+- no drop, though the drop of the pixels around, at this pixel's brightness, would have been seen:
+  the pixel is either *never unlit* or in the scene's own shadow. In such a shadow it is about as
+  bright as its surroundings are unlit, and the occluder passed on both sides of it.
+- no drop, and none to be expected of so dark a pixel: the same question is put to the mean of a
+  cell of pixels, whose noise is smaller.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation import light_model
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import Judgement, bits, finish
+from daemon.separation.noise import TemporalNoise, noise_range
+from daemon.separation.order import Ranked
+from daemon.separation.radiometry import Plane, Response
+from daemon.separation.references import References
+
+CELL = 8
+"""Side of a cell, in pixels: its mean has an eighth of a pixel's noise."""
+
+LEAST_DROP = 0.05
+"""A smaller part of the light comes and goes with interreflection when an occluder passes by."""
+
+LEAST_SHARE = 0.15
+"""Nor is a drop the occluder's that is a smaller share of what most of the crossed scene lost."""
+
+DARKEST, BRIGHTEST = 4, 2
+"""Samples kept a pixel: enough to tell one frame in the umbra from several."""
+
+_TINY = np.float32(1e-6)
+_SAMPLE = 4  # noise is measured on every fourth row and column
+
+
+class Occluder:
+    """Frames of a scene swept by an occluder's shadow -> direct, global, coverage.
+
+    L_max = L_d + g L_g and L_min = g L_g with g the part of the source that the occluder leaves
+    (a stick: 1), b = 0 in the umbra. `planes["coverage"]` (uint16) counts the frames near a pixel's
+    minimum, up to `DARKEST`; 0 where it was never unlit.
+    """
+
+    def __init__(self, response: Response, *, lit_fraction: float) -> None:
+        self._response = response
+        self._alpha = lit_fraction
+        self._references = References(response)
+        self._low = Ranked(DARKEST, largest=False)
+        self._high = Ranked(BRIGHTEST, largest=True)
+        self._cell_low: Plane | None = None
+        self._cell_high: Plane | None = None
+        self._pixel_noise = TemporalNoise(response.full_scale)
+        self._cell_noise = TemporalNoise(response.full_scale)
+        self._last: tuple[NDArray[Any], Plane] | None = None
+        self._unused = 0
+
+    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
+        """See `Estimator`. Raises ValueError for an observation that cannot be respected."""
+        if observation.strength != 1.0 or observation.warp is not None:
+            raise ValueError("an occluder's extremes are taken as they are: no warp, strength 1")
+        if not observation.used:
+            self._unused += 1
+        elif observation.lighting is not Lighting.PATTERN:
+            self._references.add(pixels, observation.lighting)
+        else:
+            self._low.add(pixels)
+            self._high.add(pixels)
+            self._watch(pixels)
+
+    def _watch(self, pixels: NDArray[Any]) -> None:
+        """Keep what tells of noise and of the shadow's way."""
+        cells = _cells(pixels)
+        sample = np.ascontiguousarray(pixels[::_SAMPLE, ::_SAMPLE])
+        if self._cell_low is None or self._cell_high is None:
+            self._cell_low, self._cell_high = cells.copy(), cells.copy()
+        else:
+            np.minimum(self._cell_low, cells, out=self._cell_low)
+            np.maximum(self._cell_high, cells, out=self._cell_high)
+        if self._last is not None:
+            self._pixel_noise.add(self._last[0], sample)
+            self._cell_noise.add(self._last[1], cells)
+        self._last = sample, cells
+
+    def result(self) -> Components:
+        """See `Estimator`. Raises NotYet before two frames are in."""
+        frames = self._low.frames
+        if frames < 2:
+            raise NotYet(f"an occluder's sweep needs 2 frames, {frames} came so far")
+        low = self._response.linear(self._low.planes)
+        high = self._response.linear(self._high.planes)
+        brightest, darkest = high[0], low[0]
+        pixel_noise = self._pixel_noise.noise()
+        deviation = self._response.deviation(pixel_noise, self._high.planes[0])
+        cells = self._cells(frames)
+        seen = self._seen(low, high, deviation, frames, cells)
+        never = _never_unlit(seen, brightest, deviation, frames, cells)
+        coverage = _near_minimum(low, high, deviation)
+        single = ~never & seen & (coverage == 1)
+        coverage[never] = 0
+        ambient = self._references.mean(Lighting.AMBIENT)
+        if ambient is not None:
+            brightest, darkest = brightest - ambient, darkest - ambient
+        direct, indirect = light_model.from_extremes(brightest, darkest, self._alpha)
+        return finish(
+            direct,
+            indirect,
+            response=self._response,
+            brightest=high[0],
+            saturated=self._high.planes[0] >= self._response.saturated_from,
+            flags=bits(never, Quality.NEVER_UNLIT) | bits(single, Quality.SINGLE),
+            planes={"coverage": coverage},
+            judgement=Judgement.of_extremes(deviation, frames),
+            facts={
+                "estimator": "maxmin",
+                "frames": frames,
+                "unused_frames": self._unused,
+                "lit_fraction": self._alpha,
+                "leakage": 0.0,
+                **self._references.facts("ambient frame" if ambient is not None else "none"),
+            },
+        )
+
+    def _cells(self, frames: int) -> _Cells:
+        """What the cells' means tell of the shadow's way."""
+        if self._cell_low is None or self._cell_high is None:
+            raise NotYet("no frame has come yet")
+        low = self._response.linear_between(self._cell_low)
+        high = self._response.linear_between(self._cell_high)
+        deviation = self._response.deviation(self._cell_noise.noise(), self._cell_high)
+        noisy: Plane = np.float32(noise_range(frames)) * deviation
+        fraction = np.divide(high - low, np.maximum(high, _TINY), dtype=np.float32)
+        least = LEAST_DROP
+        crossed = (high - low > noisy) & (fraction > least)
+        if crossed.any():
+            least = max(least, LEAST_SHARE * float(np.median(fraction[crossed])))
+            crossed &= fraction > least
+        return _Cells(low, high, noisy, fraction, crossed, least)
+
+    @staticmethod
+    def _seen(
+        low: Plane, high: Plane, deviation: Plane, frames: int, cells: _Cells
+    ) -> NDArray[np.bool_]:
+        """Pixels (H, W) whose light fell beyond noise: twice, or once with their whole cell."""
+        enough = np.maximum(
+            np.float32(noise_range(frames)) * deviation, np.float32(cells.least) * high[0]
+        )
+        twice = _any(high[1] - low[1] > enough)
+        once = _any(high[0] - low[0] > enough)
+        return twice | (once & _grown(cells.crossed, twice.shape))
+
+    def summary(self) -> dict[str, float]:
+        """Frames, those not used, and the part of the picture that the shadow has crossed."""
+        frames = self._low.frames
+        covered = float(self._cells(frames).crossed.mean()) if frames >= 2 else 0.0
+        return {"frames": float(frames), "unused": float(self._unused), "covered": covered}
+
+
+@dataclass(frozen=True, slots=True)
+class _Cells:
+    """Means of cells over the sweep, linear light (float32): the darkest, the brightest, what noise
+    explains of their difference, the fraction that was lost; whether the shadow crossed the cell,
+    and the least fraction that says so."""
+
+    low: Plane
+    high: Plane
+    noisy: Plane
+    fraction: Plane
+    crossed: NDArray[np.bool_]
+    least: float
+
+
+def _never_unlit(
+    seen: NDArray[np.bool_], brightest: Plane, deviation: Plane, frames: int, cells: _Cells
+) -> NDArray[np.bool_]:
+    """Pixels (H, W) that the shadow never reached, as far as the pixels around can tell."""
+    if not cells.crossed.any():
+        return np.ones_like(seen)
+    weight = np.where(cells.crossed, cells.fraction, np.float32(0)) ** 4
+    unlit_around, lit_around = _around(cells.low, weight), _around(cells.high, weight)
+    lost = lit_around - unlit_around
+    fraction = np.divide(lost, np.maximum(lit_around, _TINY), dtype=np.float32)
+    between: Plane = (unlit_around + lit_around) * np.float32(0.5)
+    passed_by = _enclosed(cells.crossed)
+
+    cell_never = (
+        ~cells.crossed
+        & (fraction * cells.high > np.maximum(cells.noisy, cells.least * cells.high))
+        & ~((cells.high < between) & passed_by)
+    )
+    shape = seen.shape
+    grey = _grey(brightest)
+    expected = _smooth(fraction, shape) * grey
+    tells = expected > np.maximum(
+        np.float32(noise_range(frames)) * _grey(deviation), cells.least * grey
+    )
+    shadow = (grey < _smooth(between, shape)) & _grown(passed_by, shape)
+    near = cv2.dilate(cell_never.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return ~seen & np.where(tells, ~shadow & _grown(near, shape), _grown(cell_never, shape))
+
+
+def _near_minimum(low: Plane, high: Plane, deviation: Plane) -> NDArray[np.uint16]:
+    """How many of the kept darkest samples lie near the darkest, in the channel with most."""
+    tolerance = np.maximum(np.float32(4.0) * deviation, np.float32(0.1) * (high[0] - low[0]))
+    near = np.count_nonzero(low - low[0] <= tolerance, axis=0)
+    return np.asarray(near if near.ndim == 2 else near.max(axis=2), dtype=np.uint16)
+
+
+def _cells(pixels: NDArray[Any]) -> Plane:
+    """Means of cells of CELL x CELL pixels and all channels: float32, the last ones partial."""
+    height, width = (-(-n // CELL) for n in pixels.shape[:2])
+    pad = ((0, height * CELL - pixels.shape[0]), (0, width * CELL - pixels.shape[1]))
+    whole = (
+        pixels
+        if not any(after for _, after in pad)
+        else cv2.copyMakeBorder(pixels, 0, pad[0][1], 0, pad[1][1], cv2.BORDER_REPLICATE)
+    )
+    rows = np.add.reduce(
+        whole.reshape(height, CELL, -1), axis=1, dtype=np.uint32
+    )  # (height, width * CELL * channels)
+    sums = np.add.reduce(rows.reshape(height, width, -1), axis=2, dtype=np.uint32)
+    samples = CELL * CELL * (1 if pixels.ndim == 2 else pixels.shape[2])
+    return np.asarray(sums, dtype=np.float32) * np.float32(1.0 / samples)
+
+
+def _around(plane: Plane, weight: Plane) -> Plane:
+    """Each cell's surroundings: weighted means, from as near as there is any weight."""
+    filled = np.zeros_like(plane)
+    missing = np.ones(plane.shape, dtype=np.bool_)
+    values = plane * weight
+    enough = np.float32(0.02) * weight.max()
+    reach = 2.0
+    while missing.any():
+        near = np.asarray(cv2.GaussianBlur(weight, (0, 0), reach), dtype=np.float32)
+        total = np.asarray(cv2.GaussianBlur(values, (0, 0), reach), dtype=np.float32)
+        found = missing & (near > enough)
+        filled[found] = total[found] / near[found]
+        missing &= ~found
+        reach *= 2.0
+        if reach > max(plane.shape):
+            filled[missing] = values.sum() / weight.sum()
+            break
+    return filled
+
+
+def _grown(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """A mask of cells as one of pixels."""
+    pixels = np.repeat(np.repeat(mask, CELL, axis=0), CELL, axis=1)
+    return pixels[: shape[0], : shape[1]]
+
+
+def _smooth(plane: Plane, shape: tuple[int, ...]) -> Plane:
+    """A plane of cells as one of pixels, interpolated between the cells' centres."""
+    size = (plane.shape[1] * CELL, plane.shape[0] * CELL)
+    pixels = cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(pixels[: shape[0], : shape[1]], dtype=np.float32)
+
+
+def _enclosed(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells from which a crossed cell lies in three of the four directions at least."""
+    left = np.logical_or.accumulate(seen, axis=1)
+    right = np.logical_or.accumulate(seen[:, ::-1], axis=1)[:, ::-1]
+    above = np.logical_or.accumulate(seen, axis=0)
+    below = np.logical_or.accumulate(seen[::-1], axis=0)[::-1]
+    sides = left.astype(np.uint8) + right + above + below
+    return np.asarray(sides >= 3)
+
+
+def _any(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return mask if mask.ndim == 2 else np.asarray(np.logical_or.reduce(mask, axis=2))
+
+
+def _grey(light: Plane) -> Plane:
+    return light if light.ndim == 2 else np.asarray(light.mean(axis=2), dtype=np.float32)

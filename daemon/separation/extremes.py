@@ -1,0 +1,130 @@
+"""Separation by the brightest and the darkest sample of each pixel: the paper's own (§3.3, §4.1).
+
+Samples are compared in the camera's own type, where nothing wraps and nothing is converted; light
+is computed once, at the result. An update is one in-place maximum and one minimum.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation import light_model
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation
+from daemon.separation.finish import Judgement, finish
+from daemon.separation.radiometry import FrameMean, Plane, Response
+from daemon.separation.references import References
+from daemon.separation.scan_noise import ScanNoise
+
+
+class MaxMin:
+    """L_max and L_min over patterns of one lit fraction -> direct, global (Eq. 8).
+
+    With `average` > 1 the frames of each pattern are averaged in linear light before they are
+    compared; a pattern counts once its last frame is in.
+    """
+
+    def __init__(
+        self, response: Response, *, lit_fraction: float, leakage: float, average: int = 1
+    ) -> None:
+        self._response = response
+        self._alpha = lit_fraction
+        self._leakage = leakage
+        self._references = References(response)
+        self._mean = FrameMean(response) if average > 1 else None
+        self._noise = ScanNoise(response, average)
+        self._open: int | None = None  # the pattern being averaged
+        self._max: NDArray[Any] | None = None
+        self._min: NDArray[Any] | None = None
+        self._saturated: NDArray[np.bool_] | None = None  # of averaged frames; else the max tells
+        self._patterns = 0
+        self._unused = 0
+
+    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
+        """See `Estimator`. Raises ValueError for an observation that comparing cannot respect."""
+        if observation.strength != 1.0 or observation.warp is not None:
+            raise ValueError("max/min compares frames as they are: no warp, strength 1")
+        if observation.lighting is not Lighting.PATTERN:
+            if observation.used:
+                self._references.add(pixels, observation.lighting)
+            else:
+                self._unused += 1
+            return
+        if self._mean is None:
+            if observation.used:
+                if self._max is None:
+                    self._noise.add(pixels, observation.pattern)
+                self._compare(pixels)
+            else:
+                self._unused += 1
+            return
+        self._average(self._mean, pixels, observation)
+
+    def _average(self, mean: FrameMean, pixels: NDArray[Any], observation: Observation) -> None:
+        if self._open is not None and self._open != observation.pattern:
+            self._close(mean)
+        self._open = observation.pattern
+        if observation.used:
+            mean.add(pixels)
+            self._noise.add(pixels, observation.pattern)
+            if self._saturated is None:
+                self._saturated = np.zeros(pixels.shape, dtype=np.bool_)
+            self._saturated |= pixels >= self._response.saturated_from
+        else:
+            self._unused += 1
+        if observation.last:
+            self._close(mean)
+
+    def _close(self, mean: FrameMean) -> None:
+        if mean.frames:
+            self._compare(mean.value())
+        mean.clear()
+        self._open = None
+
+    def _compare(self, samples: NDArray[Any]) -> None:
+        if self._max is None or self._min is None:
+            self._max, self._min = samples.copy(), samples.copy()
+        else:
+            np.maximum(self._max, samples, out=self._max)
+            np.minimum(self._min, samples, out=self._min)
+        self._patterns += 1
+
+    def result(self) -> Components:
+        """See `Estimator`. Raises NotYet before two patterns are in."""
+        if self._max is None or self._min is None or self._patterns < 2:
+            raise NotYet(f"max/min needs 2 patterns, {self._patterns} came so far")
+        brightest, darkest = self._light(self._max), self._light(self._min)
+        saturated = self._saturated
+        if saturated is None:
+            saturated = self._max >= self._response.saturated_from
+        ambient, source = self._references.ambient(brightest, darkest, self._alpha, self._leakage)
+        lit, unlit = brightest, darkest
+        if ambient is not None:
+            lit, unlit = brightest - ambient, darkest - ambient
+        direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
+        return finish(
+            direct,
+            indirect,
+            response=self._response,
+            brightest=brightest,
+            saturated=saturated,
+            judgement=Judgement.of_extremes(self._noise.deviation(brightest), self._patterns),
+            facts={
+                "estimator": "maxmin",
+                "patterns": self._patterns,
+                "unused_frames": self._unused,
+                "lit_fraction": self._alpha,
+                "leakage": self._leakage,
+                "noise_from": self._noise.source,
+                **self._references.facts(source),
+            },
+        )
+
+    def _light(self, samples: NDArray[Any]) -> Plane:
+        return self._response.linear(samples) if self._mean is None else samples
+
+    def summary(self) -> dict[str, float]:
+        """Patterns compared and frames not used."""
+        return {"patterns": float(self._patterns), "unused": float(self._unused)}

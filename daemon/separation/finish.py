@@ -1,0 +1,146 @@
+"""From separated samples to what is kept: quality bits, figures, colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation import mosaic
+from daemon.separation.estimator import Components, Quality
+from daemon.separation.noise import noise_range
+from daemon.separation.radiometry import Plane, Response
+
+SIGNIFICANT = 3.0
+"""How many standard deviations tell a component from noise."""
+
+DEVIATIONS = frozenset({"direct_std", "global_std"})
+"""Planes that have a component's shape."""
+
+_BINS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What noise alone can make of a sample's components, as limits (float32, a frame's shape):
+    direct below `direct` and total below `total` are not told from none; `deviation` is that of one
+    frame's light."""
+
+    direct: Plane
+    total: Plane
+    deviation: Plane
+
+    @classmethod
+    def of_extremes(cls, deviation: Plane, samples: int) -> Judgement:
+        """For the largest and smallest of so many samples."""
+        limit = np.float32(noise_range(samples)) * deviation
+        return cls(limit, limit, deviation)
+
+
+def finish(
+    direct: Plane,
+    indirect: Plane,
+    *,
+    response: Response,
+    brightest: Plane,
+    saturated: NDArray[np.bool_],
+    judgement: Judgement,
+    facts: dict[str, Any],
+    flags: NDArray[np.uint16] | None = None,
+    planes: dict[str, NDArray[Any]] | None = None,
+) -> Components:
+    """Judge the samples' components, then make colours of a mosaic.
+
+    `direct`, `indirect`, `brightest` (linear light, ambient included) and `saturated` have the
+    shape of a frame; `flags` (H, W) are the method's own bits, of which NEVER_LIT and NEVER_UNLIT
+    make both components NaN. Of `planes`, deviations have a frame's shape and get colours too.
+    """
+    planes = dict(planes or {})
+    quality = judge(direct, indirect, saturated, judgement)
+    if flags is not None:
+        quality |= flags
+    unknown = quality & np.uint16(Quality.NEVER_LIT | Quality.NEVER_UNLIT) != 0
+    direct[unknown] = np.nan
+    indirect[unknown] = np.nan
+    quality[unknown] &= np.uint16(~(Quality.LOW_MODULATION | Quality.NEGATIVE) & 0xFFFF)
+    if response.bayer:
+        # A colour is interpolated from its neighbours: what is wrong with them is wrong with it.
+        quality = spread(quality, Quality.SATURATED)
+        direct, indirect = (mosaic.demosaic(x, response.bayer) for x in (direct, indirect))
+        for name in DEVIATIONS & planes.keys():
+            planes[name] = mosaic.demosaic(planes[name], response.bayer)
+        direct[unknown] = np.nan
+        indirect[unknown] = np.nan
+    figures = {
+        **facts,
+        "noise_counts": round(float(np.nanmedian(judgement.deviation)), 4),
+        "black_level": response.black,
+        "tone": response.tone,
+        "full_scale": response.full_scale,
+        "saturated_from": response.saturated_from,
+        "quality": count(quality),
+        "exposure_histogram": histogram(brightest, response.linear_full_scale),
+    }
+    return Components(direct, indirect, quality, planes, figures)
+
+
+def judge(
+    direct: Plane, indirect: Plane, saturated: NDArray[np.bool_], judgement: Judgement
+) -> NDArray[np.uint16]:
+    """Quality bits of each pixel (H, W) uint16 that follow from values and noise alone.
+
+    A pixel is dark or of low modulation when each of its channels is; saturated or negative when
+    one of them is.
+    """
+    with np.errstate(invalid="ignore"):
+        dark = _every(direct + indirect < judgement.total)
+        flat = _every(direct < judgement.direct)
+        negative = _some((direct < -judgement.direct) | (indirect < -2 * judgement.total))
+    quality = bits(_some(saturated), Quality.SATURATED)
+    quality |= bits(dark, Quality.DARK)
+    quality |= bits(flat, Quality.LOW_MODULATION)
+    quality |= bits(negative, Quality.NEGATIVE)
+    return quality
+
+
+def spread(quality: NDArray[np.uint16], flag: Quality) -> NDArray[np.uint16]:
+    """The same bits, with `flag` also at the eight neighbours of each pixel that has it."""
+    padded = np.pad((quality & flag) != 0, 1)
+    near = np.zeros(quality.shape, dtype=np.bool_)
+    height, width = quality.shape
+    for y in range(3):
+        for x in range(3):
+            near |= padded[y : y + height, x : x + width]
+    return quality | bits(near, flag)
+
+
+def bits(mask: NDArray[np.bool_], flag: Quality) -> NDArray[np.uint16]:
+    """A mask as a plane of one quality bit (uint16)."""
+    return mask.astype(np.uint16) * np.uint16(flag)
+
+
+def count(quality: NDArray[np.uint16]) -> dict[str, dict[str, float]]:
+    """Pixels with each quality bit: their number and their fraction."""
+    found: dict[str, dict[str, float]] = {}
+    for flag in Quality:
+        pixels = int(np.count_nonzero(quality & np.uint16(flag)))
+        name = (flag.name or "").lower()
+        found[name] = {"pixels": pixels, "fraction": round(pixels / quality.size, 6)}
+    return found
+
+
+def histogram(light: Plane, full_scale: float) -> dict[str, Any]:
+    """Counts of samples in equal bins from 0 to full scale (both ends include what is beyond)."""
+    scaled = np.clip(light * np.float32(_BINS / full_scale), 0, _BINS - 1)
+    counts = np.bincount(scaled[np.isfinite(scaled)].astype(np.intp), minlength=_BINS)
+    return {"bins": _BINS, "to": round(full_scale, 3), "counts": counts.tolist()}
+
+
+def _every(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return mask if mask.ndim == 2 else np.logical_and.reduce(mask, axis=2)
+
+
+def _some(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return mask if mask.ndim == 2 else np.logical_or.reduce(mask, axis=2)

@@ -1,0 +1,142 @@
+"""The noise of a camera, measured in pictures of the scan itself.
+
+Noise is given as a standard deviation against the level of encoded counts, so that it holds for
+any tone curve; two frames of an unchanged scene tell it best (`TemporalNoise`), one picture tells
+an upper bound (`from_picture`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Plane = NDArray[np.float32]
+
+_MAD = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
+_ROUNDING = 12.0**-0.5  # deviation of a count's rounding error
+
+_LEVELS = 32
+_PER_OCTAVE = 8  # bins of a difference: 1/8 octave
+_BINS = 17 * _PER_OCTAVE
+_ENOUGH = 200  # differences that make a level's deviation
+
+_SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
+_SECOND_DIFFERENCE_NORM = 6.0  # what it makes of independent samples of deviation 1
+_BLOCK = 16
+_BLOCKS = 12  # blocks that make a level's deviation
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Standard deviation of one frame's counts at levels of counts (both encoded, ascending)."""
+
+    levels: tuple[float, ...]
+    deviations: tuple[float, ...]
+
+    def deviation(self, counts: NDArray[Any]) -> Plane:
+        """Standard deviation at each sample's level: float32, same shape; linear between levels."""
+        return np.asarray(np.interp(counts, self.levels, self.deviations), dtype=np.float32)
+
+    @property
+    def typical(self) -> float:
+        """The median over levels, for people."""
+        return float(np.median(self.deviations))
+
+
+class TemporalNoise:
+    """Noise from pairs of frames in which most of the scene was the same.
+
+    Differences are counted by level and size; the median of a level's tells its noise, whatever
+    moved in less than half of the picture. Memory: one small table.
+    """
+
+    def __init__(self, full_scale: int) -> None:
+        self._full_scale = full_scale
+        self._table = np.zeros((_LEVELS, _BINS), dtype=np.int64)
+        self.pairs = 0
+
+    def add(self, one: NDArray[Any], other: NDArray[Any]) -> None:
+        """Take in two frames of one shape (uint8, uint16 or float32 counts). Copies of one frame,
+        as in slowed-down videos, say nothing and are left out."""
+        difference = np.abs(one.astype(np.float32) - other)
+        if not difference.any():
+            return
+        level = np.minimum(one.astype(np.float32) * (_LEVELS / (self._full_scale + 1)), _LEVELS - 1)
+        size = np.minimum(np.log2(1.0 + difference) * _PER_OCTAVE, _BINS - 1)
+        flat = level.astype(np.intp) * _BINS + size.astype(np.intp)
+        counted = np.bincount(flat.reshape(-1), minlength=_LEVELS * _BINS)
+        self._table += counted.reshape(_LEVELS, _BINS)
+        self.pairs += 1
+
+    def noise(self) -> Noise | None:
+        """The deviation by level, never less than the rounding of counts; None for want of data."""
+        levels, deviations = [], []
+        for index, row in enumerate(self._table):
+            if row.sum() < _ENOUGH:
+                continue
+            found = _MAD * _median_difference(row) / np.sqrt(2.0)
+            levels.append((index + 0.5) * (self._full_scale + 1) / _LEVELS)
+            deviations.append(float(max(found, _ROUNDING)))
+        return Noise(tuple(levels), tuple(deviations)) if levels else None
+
+
+def _median_difference(row: NDArray[np.int64]) -> float:
+    """The median of a row of the table; differences of whole counts stand for ± half a count."""
+    edges = np.exp2(np.arange(_BINS + 1) / _PER_OCTAVE) - 1.0
+    share = np.cumsum(row) / row.sum()
+    at = int(np.searchsorted(share, 0.5))
+    before = share[at - 1] if at else 0.0
+    within = (0.5 - before) / (share[at] - before)
+    # a bin holds at most one whole count where it is narrow: spread it over ± half a count
+    low, high = edges[at], edges[at + 1]
+    if high - low < 1.0:
+        whole = np.ceil(low)
+        low, high = max(whole - 0.5, 0.0), whole + 0.5
+    return float(low + within * (high - low))
+
+
+def noise_range(samples: int) -> float:
+    """How far apart noise alone may drive the largest and smallest of so many samples, in standard
+    deviations: the bound 2√(2 ln n) of a Gaussian's mean range, and 2 more to be sure."""
+    return float(2.0 * np.sqrt(2.0 * np.log(max(samples, 2))) + 2.0)
+
+
+def from_picture(counts: Plane, full_scale: int, step: int = 1) -> Noise:
+    """Noise of a single picture (H, W) by level: what a second difference leaves where the scene is
+    smooth.
+
+    Textured blocks say too much, so that at each level the quietest fifth of the blocks speaks: an
+    upper bound in a scene that is textured everywhere. `step` is the distance of samples of one
+    colour (2 in a mosaic). Never less than the rounding of counts.
+    """
+    plane = np.ascontiguousarray(counts[::step, ::step])
+    height, width = (n // _BLOCK for n in plane.shape)
+    if height * width == 0:
+        return Noise((0.0, float(full_scale)), (_ROUNDING, _ROUNDING))
+    second = np.abs(cv2.filter2D(plane, -1, _SECOND_DIFFERENCE, borderType=cv2.BORDER_REFLECT))
+
+    def by_block(values: Plane) -> Plane:
+        tiles = values[: height * _BLOCK, : width * _BLOCK]
+        tiles = tiles.reshape(height, _BLOCK, width, _BLOCK).transpose(0, 2, 1, 3)
+        return np.asarray(np.median(tiles.reshape(height * width, -1), axis=1))
+
+    spread, level = by_block(np.asarray(second, dtype=np.float32)), by_block(plane)
+    order = np.argsort(level, kind="stable")
+    levels, deviations = [], []
+    for group in np.array_split(order, min(max(order.size // _BLOCKS, 1), 8)):
+        quiet = float(np.quantile(spread[group], 0.2)) * _MAD / _SECOND_DIFFERENCE_NORM
+        levels.append(float(np.mean(level[group])))
+        deviations.append(max(quiet, _ROUNDING))
+    return Noise(tuple(levels), tuple(deviations))
+
+
+def from_frame(counts: NDArray[Any], full_scale: int, bayer: str) -> Noise:
+    """`from_picture` of a frame (H, W) or (H, W, 3): the noisiest of its channels."""
+    if counts.ndim == 2:
+        return from_picture(counts.astype(np.float32), full_scale, step=2 if bayer else 1)
+    channels = (from_picture(c.astype(np.float32), full_scale) for c in np.moveaxis(counts, 2, 0))
+    return max(channels, key=lambda one: one.typical)

@@ -1,0 +1,123 @@
+"""Separation from a pattern and its complement (§3.3, Eq. 8)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation import light_model
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation
+from daemon.separation.finish import Judgement, finish
+from daemon.separation.radiometry import FrameMean, Plane, Response
+from daemon.separation.references import References
+from daemon.separation.scan_noise import ScanNoise
+
+_RESIDUAL = 0.02
+"""Part of the light by which a pattern and its complement may miss black and white together."""
+
+
+class ComplementPair:
+    """Two images -> direct, global. Frames of pattern 0 and of its complement, pattern 1, are
+    averaged in linear light; both have come when there is a result."""
+
+    def __init__(
+        self, response: Response, *, lit_fraction: float, leakage: float, average: int = 1
+    ) -> None:
+        self._response = response
+        self._alpha = lit_fraction
+        self._leakage = leakage
+        self._references = References(response)
+        self._means = (FrameMean(response), FrameMean(response))
+        self._noise = ScanNoise(response, average)
+        self._saturated: NDArray[np.bool_] | None = None
+        self._unused = 0
+
+    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
+        """See `Estimator`. Raises ValueError for an observation that cannot be respected."""
+        if observation.strength != 1.0 or observation.warp is not None:
+            raise ValueError("a complement pair is taken as it is: no warp, strength 1")
+        if not observation.used:
+            self._unused += 1
+        elif observation.lighting is not Lighting.PATTERN:
+            self._references.add(pixels, observation.lighting)
+        else:
+            self._means[observation.pattern].add(pixels)
+            self._noise.add(pixels, observation.pattern)
+            if self._saturated is None:
+                self._saturated = np.zeros(pixels.shape, dtype=np.bool_)
+            self._saturated |= pixels >= self._response.saturated_from
+
+    def result(self) -> Components:
+        """See `Estimator`. Raises NotYet before both images are in."""
+        missing = [
+            n
+            for n, mean in zip(("pattern", "complement"), self._means, strict=True)
+            if not mean.frames
+        ]
+        if missing or self._saturated is None:
+            raise NotYet(f"two images are needed: the {' and the '.join(missing)} is missing")
+        first, second = (mean.value() for mean in self._means)
+        ambient, source = self._ambient(first, second)
+        lit, unlit = (first, second) if ambient is None else (first - ambient, second - ambient)
+        brightest = np.maximum(first, second)
+        direct, indirect = light_model.from_complement_pair(lit, unlit, self._alpha, self._leakage)
+        return finish(
+            direct,
+            indirect,
+            response=self._response,
+            brightest=brightest,
+            saturated=self._saturated,
+            judgement=Judgement.of_extremes(self._noise.deviation(brightest), 2),
+            facts={
+                "estimator": "complement pair",
+                "patterns": 2,
+                "unused_frames": self._unused,
+                "lit_fraction": self._alpha,
+                "leakage": self._leakage,
+                "noise_from": self._noise.source,
+                **self._references.facts(source),
+                **self._residual(first, second),
+            },
+        )
+
+    def _ambient(self, first: Plane, second: Plane) -> tuple[Plane | None, str]:
+        """Ambient light; a black frame's leakage is (L_d + L_g) b, and P + I = 2A + (1 + b) times
+        the same whole, so that A = K - b(P + I - 2K)/(1 - b) whatever α is."""
+        off = self._references.mean(Lighting.AMBIENT)
+        if off is not None:
+            return off, "ambient frame"
+        black = self._references.mean(Lighting.BLACK)
+        if black is None:
+            return None, "none"
+        b = self._leakage
+        whole: Plane = (first - black) + (second - black)
+        ambient: Plane = black - whole * np.float32(b / (1.0 - b))
+        return ambient, "black frame and the pair"
+
+    def _residual(self, first: Plane, second: Plane) -> dict[str, Any]:
+        """Median of (P + I - W - K)/(W + K): not 0 for a wrong tone curve."""
+        black = self._references.mean(Lighting.BLACK)
+        white = self._references.mean(Lighting.WHITE)
+        if black is None or white is None:
+            return {}
+        whole = white + black
+        bright = whole > 0.1 * float(np.max(whole))
+        residual = (first + second - whole)[bright] / whole[bright]
+        found = round(float(np.median(residual)), 5)
+        return {
+            "complement_residual": found,
+            "advice": [
+                f"the two images together have {found:+.1%} of the light of black and white "
+                "together: the camera's tone curve is not the one given, or the source changed; "
+                "give the curve with --tone"
+            ]
+            if abs(found) > _RESIDUAL
+            else [],
+        }
+
+    def summary(self) -> dict[str, float]:
+        """Frames of both images, and those not used."""
+        frames = sum(mean.frames for mean in self._means)
+        return {"frames": float(frames), "unused": float(self._unused)}

@@ -1,0 +1,405 @@
+"""The step loop: show -> expose -> frame, in step, with no fixed sleeps.
+
+For a pattern step the light is first this pattern's (`show` returns at that moment), then the
+camera is triggered; the next pattern is drawn while the exposure lasts and flipped as soon as it
+ends, so that readout and flip go on side by side:
+
+    projector   |flip k|..........|flip k+1|..........
+    camera             |expose k| readout k |expose k+1|
+
+A frame counts only if its exposure lies wholly within the time in which its pattern was lit, by
+the device's own time stamps, and if it looks like its pattern (`daemon.proof`). One that does not,
+that is incomplete, or that did not come in time is exposed again, `attempts` times in all; then it
+is an explicit missing record. Repeating is safe because a frame that is not recorded has no effect.
+
+Of the rig's calibration two things are applied here: the light is this pattern's only `latency_s`
+after the projector said so, and images are drawn through the inverse of its `tone`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from daemon.config import SequencerSection
+from daemon.control import Control
+from daemon.devicethread import Session, Stuck
+from daemon.patterns import predistorted, render
+from daemon.proof import Proof
+from daemon.recorder import Exposed, Recorder
+from daemon.rig import SAFE_S, Rig
+from daemon.ring import Buffer, Ring
+from daemon.scans.method import Digest, Expose, Method, Step, Watch
+from drivers.base import (
+    Acquisition,
+    Camera,
+    CameraInfo,
+    CameraSettings,
+    DeviceGarbled,
+    DeviceTimeout,
+    EndOfRecording,
+    Frame,
+)
+from drivers.clock import NS
+from protocol.patterns import AnyPattern
+
+SHOW_S = 5.0
+"""Deadline of a flip: many refreshes, even of a slow projector."""
+CALL_S = 5.0
+"""Deadline of a camera call that does not wait for light."""
+_RING_S = 30.0
+"""How long a stepped scan waits for the recorder before it says that the disk does not keep up."""
+
+log = structlog.get_logger(__name__)
+
+
+class Behind(Exception):
+    """The recorder gives no buffer back: the disk does not keep up."""
+
+
+@dataclass(slots=True)
+class _Exposure:
+    """A frame that has been triggered and is being read out."""
+
+    index: int
+    step: Expose
+    sub: int
+    lit_ns: int  # from when the light was the pattern's
+    dark_ns: int  # until when it was; 0: it still is
+    image: NDArray[np.uint8] | None  # what the projector was given
+    end_ns: int  # when the camera said that the exposure would end
+    buffer: Buffer
+    grab: Future[Frame]
+    attempt: int
+
+
+class Sequencer:
+    """One scan in its course, in the thread that calls `run`."""
+
+    def __init__(
+        self,
+        *,
+        rig: Rig,
+        session: Session,
+        control: Control,
+        method: Method[Any],
+        recorder: Recorder,
+        ring: Ring,
+        patience: SequencerSection,
+        may_go_on: Callable[[], None],
+        on_pause: Callable[[str], None],
+    ) -> None:
+        self._rig = rig
+        self._session = session
+        self._control = control
+        self._method = method
+        self._recorder = recorder
+        self._ring = ring
+        self._patience = patience
+        self._may_go_on = may_go_on
+        self._on_pause = on_pause
+        self._clock = rig.clock
+        self._camera = rig.camera
+        self._info: CameraInfo = rig.camera.device.info()
+        self._projector = None if self._info.recorded else rig.projector
+        self._acquisition: Acquisition | None = None
+        self._taken = 0
+        self._pending: _Exposure | None = None
+        self._drawn: tuple[AnyPattern, NDArray[np.uint8]] | None = None
+        calibration = method.bench.calibration or {}
+        self._latency_ns = round(float(calibration.get("latency_s", 0.0)) * NS)
+        self._tone: list[int] | None = calibration.get("tone")
+        self._exposure_us = self._camera.device.settings().exposure_us
+        self._lit: Expose | None = None
+        self._lit_ns = 0
+        self._lit_image: NDArray[np.uint8] | None = None
+        self._looks = Proof()
+
+    def run(self, step_index: int, sub: int, taken: int) -> None:
+        """All steps from `step_index`/`sub` on; `taken` frames were had before.
+
+        Raises Revoked (abort), DeviceError, Behind, or what the recorder raises.
+        """
+        self._taken = taken
+        try:
+            while (step := self._method.step(step_index, self._summary())) is not None:
+                self._may_go_on()
+                if self._control.paused:
+                    self._settle()
+                if self._control.checkpoint(self._session, self._paused):
+                    self._acquisition = None
+                if isinstance(step, Expose):
+                    self._expose(step_index, step, sub)
+                elif isinstance(step, Digest):
+                    self._digest()
+                else:
+                    self._watch(step_index, step, sub)
+                step_index, sub = step_index + 1, 0
+            self._settle()
+        finally:
+            if not self._session.ended.is_set():
+                self._camera.call(lambda c: c.stop(), CALL_S, self._session)
+                self._set_exposure(None)
+
+    def _summary(self) -> Mapping[str, float]:
+        return self._recorder.summary
+
+    def _paused(self, reason: str) -> None:
+        """Dark and held for as long as the pause lasts."""
+        self._camera.call(lambda c: c.stop(), CALL_S, self._session)
+        self._acquisition = None
+        if self._projector is not None:
+            self._projector.call(lambda p: p.safe(), SAFE_S, self._session)
+        for light in self._rig.lights.values():
+            light.call(lambda x: x.safe(), SAFE_S, self._session)
+        if self._rig.stage is not None:
+            self._rig.stage.call(lambda s: s.safe(), SAFE_S, self._session)
+        self._on_pause(reason)
+
+    # ------------------------------------------------------------ pattern steps
+
+    def _expose(self, index: int, step: Expose, first: int) -> None:
+        if first >= step.frames:
+            return
+        self._set_exposure(step.exposure_us)
+        self._acquire(Acquisition.SOFTWARE)
+        self._light(step)
+        for sub in range(first, step.frames):
+            self._settle()
+            if self._lit is not step:  # settling had to show an earlier pattern again
+                self._light(step)
+            self._pending = self._trigger(index, step, sub, attempt=1)
+            if sub + 1 == step.frames:
+                self._draw_ahead(index + 1)
+            self._await_exposure(self._pending)
+
+    def _set_exposure(self, wanted_us: float | None) -> None:
+        """Expose for so long from now on; None: as the run began."""
+        wanted_us = wanted_us or self._exposure_us
+        if wanted_us is None or wanted_us == self._camera.device.settings().exposure_us:
+            return
+        self._settle()  # what is being read out was exposed as before
+        wanted = CameraSettings(exposure_us=wanted_us)
+
+        def change(camera: Camera) -> None:
+            camera.stop()
+            camera.configure(wanted)
+
+        self._camera.call(change, CALL_S, self._session)
+        self._acquisition = None
+
+    def _digest(self) -> None:
+        """Wait until the estimator knows every frame so far."""
+        self._settle()
+        if not self._recorder.digested(_RING_S):
+            raise Behind
+
+    def _light(self, step: Expose) -> None:
+        """Make the light this step's; `_lit_ns` says from when it is."""
+        if self._pending is not None:
+            self._pending.dark_ns = self._clock.now_ns()
+        self._lit = step
+        if self._projector is None:
+            self._lit_ns = 0
+        elif step.pattern is None:
+            self._projector.call(lambda p: p.safe(), SAFE_S, self._session)
+            self._lit_ns = self._clock.now_ns() + self._latency_ns
+            self._lit_image = None
+        else:
+            image = self._lit_image = self._image(step)
+            flipped = self._projector.call(lambda p: p.show(image), SHOW_S, self._session)
+            self._lit_ns = flipped + self._latency_ns
+
+    def _image(self, step: Expose) -> NDArray[np.uint8]:
+        assert self._projector is not None
+        assert step.pattern is not None
+        if self._drawn is None or self._drawn[0] != step.pattern:
+            info = self._projector.device.info()
+            image = render(step.pattern, info.width, info.height)
+            if self._tone is not None:
+                image = predistorted(image, self._tone)
+            self._drawn = (step.pattern, image)
+        return self._drawn[1]
+
+    def _draw_ahead(self, index: int) -> None:
+        """Draw the next pattern while the exposure lasts."""
+        if self._projector is None:
+            return
+        step = self._method.step(index, self._summary())
+        if isinstance(step, Expose) and step.pattern is not None:
+            self._image(step)
+
+    def _trigger(self, index: int, step: Expose, sub: int, attempt: int) -> _Exposure:
+        buffer = self._ring.take(_RING_S)
+        if buffer is None:
+            self._recorder.check()
+            raise Behind
+        if self._projector is not None:
+            begin = self._lit_ns + round(step.delay_s * NS)
+            self._clock.wait_until(begin, self._session.ended)
+            self._session.check()
+        _, end_ns = self._camera.call(lambda c: c.trigger(), CALL_S, self._session)
+        timeout_s = self._frame_deadline()
+        grab = self._camera.submit(
+            lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, self._session
+        )
+        return _Exposure(
+            index, step, sub, self._lit_ns, 0, self._lit_image, end_ns, buffer, grab, attempt
+        )
+
+    def _frame_deadline(self) -> float:
+        exposure_us = self._camera.device.settings().exposure_us or 0.0
+        return exposure_us * 1e-6 + self._info.readout_s + self._patience.frame_timeout_s
+
+    def _await_exposure(self, exposure: _Exposure) -> None:
+        """Wait for the end of the exposure, not of the readout: then the light may change."""
+        if self._projector is not None:
+            self._clock.wait_until(exposure.end_ns, self._session.ended)
+        self._session.check()
+
+    def _settle(self) -> None:
+        """See the frame that is being read out to its end: recorded, repeated, or missing."""
+        while (exposure := self._pending) is not None:
+            problem: str
+            try:
+                frame = self._camera.wait(exposure.grab, self._frame_deadline() + CALL_S)
+                problem = self._proof(exposure, frame)
+            except Stuck:
+                raise
+            except (DeviceTimeout, DeviceGarbled) as error:
+                problem = str(error)
+                frame = None
+            self._pending = None
+            if not problem and frame is not None:
+                self._put(
+                    exposure.index,
+                    exposure.step,
+                    exposure.sub,
+                    frame,
+                    exposure.buffer,
+                    exposure.lit_ns,
+                )
+                return
+            self._ring.give(exposure.buffer)
+            if exposure.attempt < self._patience.attempts:
+                log.warning(
+                    "frame exposed again",
+                    step=exposure.index,
+                    sub=exposure.sub,
+                    attempt=exposure.attempt,
+                    problem=problem,
+                )
+                self._restart()
+                self._light(exposure.step)
+                self._pending = self._trigger(
+                    exposure.index, exposure.step, exposure.sub, exposure.attempt + 1
+                )
+                self._await_exposure(self._pending)
+            else:
+                self._restart()
+                self._miss(exposure.index, exposure.step, exposure.sub, problem)
+
+    def _restart(self) -> None:
+        """After a doubtful frame nothing in the camera's queue can be trusted: empty it."""
+        self._acquisition = None
+        self._camera.call(lambda c: c.stop(), CALL_S, self._session)
+        self._acquire(Acquisition.SOFTWARE)
+
+    def _proof(self, exposure: _Exposure, frame: Frame) -> str:
+        """Why the frame may show more or less than its pattern, by time stamps and looks; or ""."""
+        if frame.incomplete:
+            return "the frame is incomplete"
+        if self._projector is None:
+            return ""
+        if frame.start_ns < exposure.lit_ns:
+            early = (exposure.lit_ns - frame.start_ns) / NS * 1e3
+            return f"the exposure began {early:.2f} ms before its pattern was lit"
+        if exposure.dark_ns and frame.end_ns > exposure.dark_ns:
+            late = (frame.end_ns - exposure.dark_ns) / NS * 1e3
+            return f"the exposure ended {late:.2f} ms after its pattern was taken down"
+        return self._looks.problem(frame.pixels, exposure.step, exposure.image)
+
+    # ------------------------------------------------------------ video steps
+
+    def _watch(self, index: int, step: Watch, first: int) -> None:
+        self._acquire(Acquisition.FREE)
+        sub = first
+        last: int | None = None
+        while step.frames is None or sub < step.frames:
+            self._may_go_on()
+            if self._control.checkpoint(self._session, self._paused):
+                self._acquire(Acquisition.FREE)
+                last = None
+            buffer = self._ring.take(_RING_S if self._info.recorded else 0.0)
+            behind = buffer is None
+            if buffer is None:
+                if self._info.recorded:
+                    raise Behind
+                buffer = np.empty(self._info.shape, self._info.pixel_format.dtype)
+            try:
+                frame = self._grab_free(buffer)
+            except EndOfRecording:
+                self._ring.give(buffer)
+                return
+            if frame is None:
+                if not behind:
+                    self._ring.give(buffer)
+                self._miss(index, step, sub, "no frame came in time")
+                sub += 1
+                continue
+            lost = 0 if last is None else max(0, frame.sequence - last - 1)
+            for _ in range(lost):
+                self._miss(index, step, sub, "lost between camera and host")
+                sub += 1
+            last = frame.sequence
+            if behind:
+                self._miss(index, step, sub, "the recorder did not keep up")
+            else:
+                self._put(index, step, sub, frame, buffer)
+            sub += 1
+
+    def _grab_free(self, buffer: Buffer) -> Frame | None:
+        """The next frame of a stream; None if none came in time."""
+        timeout_s = self._frame_deadline()
+        try:
+            return self._camera.call(
+                lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, self._session
+            )
+        except Stuck:
+            raise
+        except DeviceTimeout as error:
+            log.warning("no frame", problem=str(error))
+            return None
+
+    # ------------------------------------------------------------ both
+
+    def _acquire(self, wanted: Acquisition) -> None:
+        if self._acquisition is wanted:
+            return
+        at = self._taken
+
+        def start(camera: Camera) -> None:
+            camera.stop()
+            camera.start(wanted, at)
+
+        self._camera.call(start, CALL_S, self._session)
+        self._acquisition = wanted
+
+    def _put(
+        self, index: int, step: Step, sub: int, frame: Frame, buffer: Buffer, lit_ns: int = 0
+    ) -> None:
+        self._taken += 1
+        self._recorder.put(
+            Exposed(step=step, index=index, sub=sub, frame=frame, buffer=buffer, lit_ns=lit_ns)
+        )
+
+    def _miss(self, index: int, step: Step, sub: int, reason: str) -> None:
+        self._taken += 1
+        log.error("frame missing", step=index, sub=sub, reason=reason)
+        self._recorder.put(Exposed(step=step, index=index, sub=sub, frame=None, missing=reason))

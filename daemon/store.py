@@ -1,0 +1,363 @@
+"""The data folder: every run is a folder that explains itself, and `run.json` is its first page.
+
+    DATA/umbrad.lock            held by the one daemon that may write here
+    DATA/runs/ID/run.json       spec, rig, versions, state, products (`RunFile`)
+    DATA/runs/ID/frames.*       see `daemon.frames`
+    DATA/runs/ID/...            products
+
+A run's folder appears under its name together with its run.json, and disappears at once: folders
+whose names begin with a dot are on their way in or out, and are swept up at the next start.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import importlib.metadata
+import math
+import os
+import platform
+import re
+import secrets
+import shutil
+import threading
+from collections.abc import Collection, Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import DTypeLike
+
+from daemon.durable import Damaged, atomic_write, fsync_folder, storage
+from drivers.clock import NS, Clock, RealClock
+from protocol.errors import Code, UmbraError
+from protocol.messages import PROTOCOL, End, Product, RunInfo, RunState
+from protocol.scans import AnyScan
+
+FORMAT = 1
+"""Of run.json; a daemon reads its own and refuses later ones."""
+
+_ID = re.compile(r"[0-9]{8}-[0-9]{6}-[a-z0-9-]+-[a-z0-9]{4}")
+_LETTERS = "abcdefghjkmnpqrstuvwxyz23456789"  # none that are taken for another
+_LINE_BYTES = 2048  # of frames.jsonl, a generous guess
+_LEAST_RESERVE = 256 << 20
+
+
+class RunFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Everything in run.json: what `RunInfo` shows, and what explains or resumes the run.
+
+    `order` is the place in the queue, the least first; `rig` the devices and settings at the
+    start; `timings` seconds by name; `estimates` of frames, seconds and bytes before the start.
+    """
+
+    format: int = FORMAT
+    id: str
+    state: RunState
+    spec: AnyScan
+    submitted: str
+    by: str = ""
+    started: str = ""
+    ended: str = ""
+    planned: int | None = None
+    recorded: int = 0
+    missing: int = 0
+    rejected: int = 0
+    end: End | None = None
+    products: tuple[Product, ...] = ()
+    parents: tuple[str, ...] = ()
+    request_id: str = ""
+    order: int = 0
+    rig: dict[str, Any] = {}
+    calibration: dict[str, Any] | None = None
+    versions: dict[str, str] = {}
+    timings: dict[str, float] = {}
+    estimates: dict[str, float] = {}
+
+
+class DataFolderInUse(UmbraError):
+    """Another daemon writes to this data folder."""
+
+
+class RunFolder:
+    """One run on disk. `file` is run.json as it is; `update` changes both. Thread-safe."""
+
+    def __init__(self, path: Path, file: RunFile) -> None:
+        self.path = path
+        self.file = file
+        self._lock = threading.Lock()
+
+    @classmethod
+    def read(cls, path: Path) -> RunFolder:
+        """A run's folder. Raises Damaged when its run.json cannot be understood."""
+        try:
+            data = (path / "run.json").read_bytes()
+            file = msgspec.json.decode(data, type=RunFile)
+        except (OSError, msgspec.DecodeError) as error:
+            raise Damaged(f"{path / 'run.json'}: {error}; restore it from a copy") from error
+        if file.format != FORMAT or file.id != path.name:
+            raise Damaged(f"{path / 'run.json'}: of run {file.id!r} in format {file.format}")
+        return cls(path, file)
+
+    @property
+    def id(self) -> str:
+        """The run's name, and its folder's."""
+        return self.file.id
+
+    def update(self, **changes: Any) -> RunFile:
+        """Change fields of run.json, durably and all or none; gives the new contents.
+
+        Raises StorageError: then `file` and the disk are as before. TypeError: no such field.
+        """
+        with self._lock:
+            return self._replace(changes)
+
+    def add_products(self, products: Iterable[Product]) -> RunFile:
+        """Add to the list of products; one of the same name takes its place. As `update`."""
+        with self._lock:
+            named = {product.name: product for product in (*self.file.products, *products)}
+            return self._replace({"products": tuple(named.values())})
+
+    def product(self, name: str) -> Path:
+        """A product's file. Raises UmbraError(unknown_product), naming those that there are."""
+        for product in self.file.products:
+            if product.name == name:
+                path = self.path / product.file
+                if path.is_file():
+                    return path
+                raise UmbraError(
+                    Code.UNKNOWN_PRODUCT, f"{self.id}: {product.file} is no longer in its folder"
+                )
+        names = ", ".join(product.name for product in self.file.products) or "none yet"
+        raise UmbraError(Code.UNKNOWN_PRODUCT, f"{self.id} has no product {name!r}; it has {names}")
+
+    def info(self) -> RunInfo:
+        """The run as clients see it."""
+        file = self.file
+        return RunInfo(**{name: getattr(file, name) for name in RunInfo.__struct_fields__})
+
+    def size(self) -> int:
+        """Bytes in the folder."""
+        return sum(p.stat().st_size for p in self.path.rglob("*") if p.is_file())
+
+    def _replace(self, changes: Mapping[str, Any]) -> RunFile:
+        file = msgspec.structs.replace(self.file, **changes)
+        with storage(f"{self.id}: writing run.json"):
+            atomic_write(self.path / "run.json", _page(file))
+        self.file = file
+        return file
+
+
+class Store:
+    """A data folder, held by one daemon at a time. Thread-safe.
+
+    `reserve_bytes` of the disk are never promised to a run, so that a run which meets them can be
+    paused, and its products still be written.
+    """
+
+    def __init__(
+        self, data: Path, reserve_bytes: int = _LEAST_RESERVE, clock: Clock | None = None
+    ) -> None:
+        """Raises DataFolderInUse, StorageError."""
+        self.data = data
+        self.reserve_bytes = reserve_bytes
+        self.damaged: dict[str, str] = {}  # folder -> what is wrong with it
+        self._clock = clock or RealClock()
+        self._runs = data / "runs"
+        self._known: dict[str, RunFolder] = {}
+        self._lock = threading.RLock()
+        with storage(f"opening the data folder {data}"):
+            self._runs.mkdir(parents=True, exist_ok=True)
+            self._held = _hold(data / "umbrad.lock")
+            for path in self._runs.glob(".*"):
+                shutil.rmtree(path)
+        self.runs()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let another daemon have the folder; idempotent."""
+        if self._held >= 0:
+            os.close(self._held)
+            self._held = -1
+
+    # ------------------------------------------------------------ runs
+
+    def create(
+        self,
+        spec: AnyScan,
+        rig: dict[str, Any],
+        by: str = "",
+        request_id: str = "",
+        *,
+        first: bool = False,
+        **fields: Any,
+    ) -> RunFolder:
+        """A new run, queued last (or first), durable on return; `fields` are RunFile's.
+
+        Raises StorageError; then there is no run.
+        """
+        with self._lock:
+            now = datetime.fromtimestamp(self._clock.utc_ns() / NS, UTC)
+            orders = [run.file.order for run in self.queued()] or [0]
+            file = RunFile(
+                id=self._new_id(now, msgspec.to_builtins(spec)["method"]),
+                state=RunState.QUEUED,
+                spec=spec,
+                submitted=now.isoformat(timespec="microseconds"),
+                by=by,
+                request_id=request_id,
+                order=min(orders) - 1 if first else max(orders) + 1,
+                rig=rig,
+                **{"versions": versions(), **fields},
+            )
+            path = self._runs / file.id
+            coming = self._runs / f".{file.id}"
+            with storage("creating a run"):
+                try:
+                    coming.mkdir()
+                    atomic_write(coming / "run.json", _page(file))
+                    coming.rename(path)
+                except OSError:
+                    shutil.rmtree(coming, ignore_errors=True)
+                    raise
+                fsync_folder(self._runs)
+            run = self._known[file.id] = RunFolder(path, file)
+            return run
+
+    def open(self, id: str) -> RunFolder:
+        """A run by its id. Raises UmbraError(unknown_run), Damaged."""
+        with self._lock:
+            path = self._runs / id
+            if not _ID.fullmatch(id) or not path.is_dir():
+                self._known.pop(id, None)
+                raise UmbraError(
+                    Code.UNKNOWN_RUN, f"there is no run {id!r}; `umbra runs` lists them"
+                )
+            if id not in self._known:
+                self._known[id] = RunFolder.read(path)
+            return self._known[id]
+
+    def runs(self) -> list[RunFolder]:
+        """All runs, the newest first; folders that cannot be read are in `damaged` instead."""
+        with self._lock:
+            found = []
+            self.damaged = {}
+            for path in self._runs.iterdir():
+                if path.name.startswith(".") or not path.is_dir():
+                    continue
+                try:
+                    found.append(self.open(path.name))
+                except UmbraError as error:
+                    self.damaged[path.name] = error.message
+            return sorted(found, key=lambda run: (run.file.submitted, run.id), reverse=True)
+
+    def queued(self) -> list[RunFolder]:
+        """The runs that wait, the next first."""
+        with self._lock:
+            waiting = [run for run in self._known.values() if run.file.state is RunState.QUEUED]
+            return sorted(waiting, key=lambda run: (run.file.order, run.id))
+
+    def find_request(self, request_id: str) -> RunFolder | None:
+        """The run that a request has already made: a repeated request gets the same one."""
+        with self._lock:
+            known = self._known.values()
+            return next((r for r in known if request_id and r.file.request_id == request_id), None)
+
+    def expire(
+        self, max_age_s: float = math.inf, max_bytes: float = math.inf, keep: Collection[str] = ()
+    ) -> list[str]:
+        """Delete ended runs older than `max_age_s`, then the oldest while all runs take more than
+        `max_bytes`; never one of `keep`, its parents, or one that has not ended. Gives their ids.
+
+        Raises StorageError; what was deleted until then stays deleted.
+        """
+        with self._lock:
+            runs = self.runs()
+            kept = set(keep).union(*(run.file.parents for run in runs if run.id in keep))
+            now = self._clock.utc_ns() / NS
+            sizes = {run.id: run.size() for run in runs}
+            total = sum(sizes.values())
+            gone = []
+            for run in reversed(runs):
+                if run.id in kept or not run.file.state.ended:
+                    continue
+                end = run.file.ended or run.file.submitted
+                age = now - datetime.fromisoformat(end).timestamp()
+                if age > max_age_s or total > max_bytes:
+                    self._delete(run)
+                    total -= sizes[run.id]
+                    gone.append(run.id)
+            return gone
+
+    # ------------------------------------------------------------ room
+
+    def free_bytes(self) -> int:
+        """What the disk has free for us, the reserve included."""
+        return shutil.disk_usage(self.data).free
+
+    def room_for(self, bytes: int) -> bool:
+        """Whether so much can be written without touching the reserve."""
+        return self.free_bytes() - self.reserve_bytes >= bytes
+
+    # ------------------------------------------------------------ inside
+
+    def _new_id(self, now: datetime, method: str) -> str:
+        while True:
+            ending = "".join(secrets.choice(_LETTERS) for _ in range(4))
+            id = f"{now:%Y%m%d-%H%M%S}-{method}-{ending}"
+            if not (self._runs / id).exists():
+                return id
+
+    def _delete(self, run: RunFolder) -> None:
+        going = self._runs / f".{run.id}"
+        with storage(f"deleting run {run.id}"):
+            run.path.rename(going)
+            self._known.pop(run.id, None)
+            fsync_folder(self._runs)
+            shutil.rmtree(going)
+
+
+def estimate_bytes(
+    shape: tuple[int, ...], dtype: DTypeLike, frames: int, pixels: bool = True
+) -> int:
+    """What a run of so many frames of a shape will take on disk, products included; generous."""
+    frame = math.prod(shape) * np.dtype(dtype).itemsize
+    products = math.prod(shape) * 4 * 6 + math.prod(shape[:2]) * 16
+    return frames * ((frame + (8 << 10) if pixels else 0) + _LINE_BYTES) + products + (4 << 20)
+
+
+def versions() -> dict[str, str]:
+    """What a result depends on: this software, its protocol, and the libraries under it."""
+    found = {"python": platform.python_version(), "protocol": str(PROTOCOL)}
+    for name in ("umbra-rig", "numpy", "opencv-contrib-python-headless"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
+
+
+def _page(file: RunFile) -> bytes:
+    return msgspec.json.format(msgspec.json.encode(file)) + b"\n"
+
+
+def _hold(path: Path) -> int:
+    """Lock a file until it is closed, or the process is no more."""
+    held = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        pid = os.read(held, 32).decode("ascii", "replace").strip()
+        os.close(held)
+        raise DataFolderInUse(
+            Code.STORAGE_FAILED,
+            f"{path.parent} is in use by another umbrad (process {pid or 'unknown'}); "
+            "stop it, or give this one a data folder of its own",
+        ) from None
+    os.truncate(held, 0)
+    os.write(held, f"{os.getpid()}\n".encode("ascii"))
+    return held

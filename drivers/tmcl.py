@@ -1,0 +1,573 @@
+"""A Trinamic TMCL module that turns an eccentric: one stepper, whose rotation is the mesh's circle.
+
+The occluder hangs on a pin at radius r of the motor's shaft, on a parallel guide, so that angle θ
+puts it at centre + r (cos θ, sin θ). It can be nowhere else: `move` takes points of that circle,
+and `circle` only that circle.
+
+The line carries 9-byte frames: address, command, type, motor, value (int32, big endian), sum of
+the bytes before. Answers: reply address, module address, status, command, value, sum. A damaged
+answer is searched for further on in what came, then asked for again.
+
+Every command sent here is safe to send again, and is, up to `ATTEMPTS` times: reads change nothing,
+positions are absolute targets, speeds and stops are states. A position read after a reconnect means
+nothing (the module may have lost its supply, or the shaft been turned): homed first.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Annotated, Any, ClassVar, Literal
+
+from msgspec import Meta
+
+from drivers.base import (
+    Context,
+    DeviceError,
+    DeviceGarbled,
+    DeviceLost,
+    DeviceRefused,
+    DeviceTimeout,
+    Identity,
+    Options,
+    Stage,
+    StageInfo,
+    StageState,
+    StageStatus,
+)
+from drivers.clock import NS
+from drivers.serialport import SerialPort, attached
+from drivers.track import Arc, Point, Track
+
+FRAME = 9
+REPLY_S = 0.2  # a module answers within 5 ms
+ATTEMPTS = 3
+NEAR_MM = 0.05  # a target this near to the circle is on it
+POLL_S = 0.02
+STALL_S = 1.0  # a motor that was told to turn has begun by then
+
+
+class Command(IntEnum):
+    """TMCL instructions that are used here."""
+
+    ROTATE_RIGHT = 1
+    ROTATE_LEFT = 2
+    STOP = 3
+    MOVE_TO = 4
+    SET_AXIS = 5
+    GET_AXIS = 6
+    REFERENCE_SEARCH = 13
+    GET_VERSION = 136
+
+
+class Axis(IntEnum):
+    """Axis parameters that are used here."""
+
+    TARGET = 0
+    POSITION = 1
+    SPEED = 3
+    MAX_SPEED = 4
+    MICROSTEPS = 140
+    PULSE_DIVISOR = 154
+
+
+STATUS = {
+    1: ("a frame reached it damaged (wrong checksum)", "check the cable"),
+    2: ("it does not know the command", "is it a TMCL stepper module?"),
+    3: ("it does not know the parameter", "set velocity_unit to match the module's firmware"),
+    4: ("a value is out of its range", "check steps_per_turn, microsteps and feeds"),
+    5: ("its EEPROM is locked", "unlock it with the maker's tool"),
+    6: ("the command is not available", "check the module's firmware"),
+}
+OK = {100, 101}
+DAMAGED = 1
+
+
+CHIPS = {(0x2A3C, None)}
+"""Trinamic's USB modules; one on RS485 shows its adapter only, and is not found."""
+
+
+class TmclOptions(Options, frozen=True, kw_only=True):
+    """[stage] driver = "tmcl"."""
+
+    port: str  # as for grbl; RS485 and USB modules alike
+    radius_mm: Annotated[float, Meta(gt=0)]  # of the eccentric
+    baud: Annotated[int, Meta(ge=1200, le=4_000_000)] = 9600
+    address: Annotated[int, Meta(ge=1, le=255)] = 1
+    motor: Annotated[int, Meta(ge=0, le=5)] = 0
+    identity: str = ""  # the module's type as it says it, e.g. "1140"; "": any
+    centre_mm: Point = (0.0, 0.0)
+    steps_per_turn: Annotated[int, Meta(ge=1)] = 200  # full steps a turn of the eccentric
+    reverse: bool = False  # the eccentric turns the other way round
+    max_feed_mm_s: Annotated[float, Meta(gt=0)] = 50.0  # along the circle
+    homing: Literal["reference", "here"] = "reference"  # reference: the module's own search
+    home_angle_deg: float = 0.0  # where the eccentric is at the reference
+    velocity_unit: Literal["pps", "internal"] = "pps"  # internal: TMCM-1140 and older
+
+
+@dataclass(slots=True)
+class _Motion:
+    """What was last asked, to go on with after a hold: a target, or for ever at a speed."""
+
+    target: int | None
+    speed: int
+
+
+class TmclStage(Stage):
+    """See the module. A new motion replaces the one under way, without a stop between them."""
+
+    options_type: ClassVar[type[Options]] = TmclOptions
+    options: TmclOptions
+
+    def __init__(self, name: str, options: Options, context: Context) -> None:
+        super().__init__(name, options, context)
+        assert isinstance(options, TmclOptions)
+        self.options = options
+        self._port = SerialPort(name, options.port, options.baud)
+        self._halted = threading.Event()
+        self._arc = Arc(options.centre_mm, options.radius_mm)
+        self._track = Track()
+        self._identity: Identity | None = None
+        self._turn = 0  # microsteps a turn
+        self._pps_unit = 1.0  # microsteps a second in one of the module's units of speed
+        self._homed = False
+        self._homing = False
+        self._held = False
+        self._motion: _Motion | None = None
+        self._position = 0  # microsteps from angle 0, unwrapped beyond 32 bits
+        self._raw = 0
+        self._at_ns = 0
+        self._stands_since_ns = 0
+        self._damaged = 0
+
+    @classmethod
+    def discover(cls) -> list[dict[str, Any]]:
+        """See Device; nothing is opened."""
+        return attached(CHIPS)
+
+    # ------------------------------------------------------------ the line
+
+    def _ask(self, command: Command, kind: int = 0, value: int = 0, *, phase: str) -> int:
+        """One exchange, repeated when it failed: every command here is safe to send again.
+
+        Raises DeviceRefused (the status by its name), DeviceTimeout, DeviceGarbled, DeviceLost.
+        """
+        o = self.options
+        frame = encode(o.address, command, kind, o.motor, value)
+        silent = True
+        for _ in range(ATTEMPTS):
+            if self._halted.is_set():
+                raise DeviceError(self.name, phase, "interrupted by a halt")
+            self._port.write(frame)
+            received = self._receive(command)
+            silent = silent and not received
+            answer = find_answer(received, o.address, command)
+            if answer is None or answer[0] == DAMAGED:
+                self._damaged += 1
+                continue
+            status, result = answer
+            if status not in OK:
+                problem, remedy = STATUS.get(status, (f"it answered status {status}", ""))
+                raise DeviceRefused(self.name, phase, f"{problem} ({command.name} {kind})", remedy)
+            return result
+        where = f"{o.port}, address {o.address}, {o.baud} baud"
+        if silent:
+            raise DeviceTimeout(
+                self.name,
+                phase,
+                f"no answer from {where} to {command.name}",
+                "check supply, cable, address and baud rate",
+            )
+        raise DeviceGarbled(
+            self.name, phase, f"only damaged answers from {where}", "check cable and baud rate"
+        )
+
+    def _receive(self, command: Command) -> bytes:
+        """What comes within `REPLY_S`, until it holds the answer. What was late is passed over."""
+        deadline = self.clock.now_ns() + round(REPLY_S * NS)
+        data = b""
+        while self.clock.now_ns() < deadline and not self._halted.is_set():
+            data += self._port.read()
+            if find_answer(data, self.options.address, command) is not None:
+                break
+        return data
+
+    def _get(self, axis: Axis, phase: str) -> int:
+        return self._ask(Command.GET_AXIS, axis, phase=phase)
+
+    def _set(self, axis: Axis, value: int, phase: str) -> None:
+        self._ask(Command.SET_AXIS, axis, value, phase=phase)
+
+    def _begin(self, phase: str) -> None:
+        self._halted.clear()
+        if not self._port.is_open:
+            raise DeviceLost(self.name, phase, "it is not connected", "reconnect it")
+
+    # ------------------------------------------------------------ life
+
+    def connect(self) -> Identity:
+        """Open, identify, read the resolution; a motor that turns is stopped. Safe to try again."""
+        self.close()
+        self._halted.clear()
+        self._port.open()
+        try:
+            identity = self._identify()
+            self._ask(Command.STOP, phase="connect")
+            self._turn = self.options.steps_per_turn << self._get(Axis.MICROSTEPS, "connect")
+            self._pps_unit = 1.0
+            if self.options.velocity_unit == "internal":
+                divisor = self._get(Axis.PULSE_DIVISOR, "connect")
+                self._pps_unit = 16e6 / (2**divisor * 2048 * 32)
+        except DeviceError:
+            self.close()
+            raise
+        self._identity = identity
+        return identity
+
+    def _identify(self) -> Identity:
+        value = self._ask(Command.GET_VERSION, 1, phase="connect") & 0xFFFFFFFF
+        model, version = str(value >> 16), f"{value >> 8 & 0xFF}.{value & 0xFF:02d}"
+        if self.options.identity and self.options.identity != model:
+            raise DeviceRefused(
+                self.name,
+                "connect",
+                f"the module is a {model}, not a {self.options.identity}",
+                "correct `port`, `address` or `identity`",
+            )
+        usb = self._port.identity
+        identity = Identity(f"TMCM-{model}", usb.serial if usb else "", version)
+        before = self._identity
+        if before is not None and (before.model, before.serial) != (
+            identity.model,
+            identity.serial,
+        ):
+            raise DeviceRefused(
+                self.name,
+                "connect",
+                f"another module ({identity.model} {identity.serial}) has come back in the place "
+                f"of {before.model} {before.serial}",
+                "restore the cabling, or restart the daemon if it was exchanged on purpose",
+            )
+        return identity
+
+    def check(self) -> None:
+        """One read of the position."""
+        self._begin("check")
+        self._read("check")
+
+    def safe(self) -> None:
+        """Stopped, held by its current, nothing to resume."""
+        if self._port.is_open:
+            self.stop()
+
+    def halt(self) -> None:
+        """See Device: a stop frame; its answer is passed over by whoever reads next."""
+        self._halted.set()
+        o = self.options
+        if self._homing:
+            frame = encode(o.address, Command.REFERENCE_SEARCH, 1, o.motor, 0)
+            self._port.urge(frame)
+        self._port.urge(encode(o.address, Command.STOP, 0, o.motor, 0))
+        self._held = True
+
+    def close(self) -> None:
+        """See Device. What turns is stopped first: nobody would hear of it."""
+        if self._port.is_open and self._motion is not None:
+            self._port.urge(encode(self.options.address, Command.STOP, 0, self.options.motor, 0))
+        self._port.close()
+        self._position_lost()
+
+    def _position_lost(self) -> None:
+        self._homed = self._held = False
+        self._motion = None
+        self._track.forget()
+
+    def facts(self) -> dict[str, Any]:
+        """See Device."""
+        return {
+            "port": self._port.path or self.options.port,
+            "homed": self._homed,
+            "radius_mm": self.options.radius_mm,
+            "microsteps_per_turn": self._turn,
+            "damaged_frames": self._damaged,
+        }
+
+    # ------------------------------------------------------------ state
+
+    def info(self) -> StageInfo:
+        """See Stage: the circle's bounding box."""
+        if not self._turn:
+            raise DeviceLost(self.name, "info", "it is not connected", "reconnect it")
+        (x, y), r = self.options.centre_mm, self.options.radius_mm
+        return StageInfo(((x - r, x + r), (y - r, y + r)), self.options.max_feed_mm_s)
+
+    def status(self) -> StageStatus:
+        """See Stage."""
+        self._begin("status")
+        return self._read("status")
+
+    def _read(self, phase: str) -> StageStatus:
+        """Position and motion now. The position is of the middle of its exchange."""
+        began = self.clock.now_ns()
+        raw = self._get(Axis.POSITION, phase)
+        at_ns = (began + self.clock.now_ns()) // 2
+        moved = (raw - self._raw + 2**31) % 2**32 - 2**31  # the counter wraps after some hours
+        seconds = (at_ns - self._at_ns) / NS
+        self._raw, self._at_ns = raw, at_ns
+        self._position += moved
+        rate = moved / seconds if seconds > 0 else 0.0
+        speed = self._get(Axis.SPEED, phase)
+        motion = self._motion
+        arrived = (
+            motion is not None
+            and motion.target is not None
+            and speed == 0
+            and raw == _signed(motion.target)
+        )
+        if arrived:
+            self._motion = None
+        self._watch(speed != 0 or motion is None or arrived or self._held, at_ns, phase)
+        at_rest = speed == 0 and (self._motion is None or self._held)
+        if not self._homed:
+            return StageStatus(
+                StageState.UNKNOWN, None, at_ns, "its position is not known: home it"
+            )
+        point = self._arc.point(self._angle())
+        self._track.add(
+            at_ns, point, speed=self._sign() * rate * self._mm(), arc=self._arc, at_rest=at_rest
+        )
+        if not at_rest:
+            state = StageState.MOVING
+        else:
+            state = StageState.HELD if self._motion is not None else StageState.IDLE
+        return StageStatus(state, point, at_ns)
+
+    def _watch(self, well: bool, at_ns: int, phase: str) -> None:
+        """A motor that was told to turn, and stands, is not MOVING for ever."""
+        if well:
+            self._stands_since_ns = 0
+        elif not self._stands_since_ns:
+            self._stands_since_ns = at_ns
+        elif at_ns - self._stands_since_ns > STALL_S * NS:
+            self._position_lost()
+            raise DeviceRefused(
+                self.name,
+                phase,
+                "it stopped short of its target",
+                "a limit switch, or the driver's own protection: check both, then `umbra stage "
+                "home`",
+            )
+
+    def _sign(self) -> int:
+        return -1 if self.options.reverse else 1
+
+    def _mm(self) -> float:
+        """Path of one microstep, mm."""
+        return math.tau * self.options.radius_mm / self._turn
+
+    def _angle(self) -> float:
+        """rad; unwrapped."""
+        turned = self._sign() * self._position / self._turn * math.tau
+        return turned + math.radians(self.options.home_angle_deg)
+
+    def position_at(self, at_ns: int) -> Point | None:
+        """See Stage. Evenly in angle between the reads: error as in drivers/track.py."""
+        return self._track.at(at_ns)
+
+    def pump(self) -> StageStatus:
+        """See Stage: a reading of 4 frames (5 ms on USB, 40 ms at 9600 baud); nothing is fed."""
+        self._begin("pump")
+        return self._read("pump")
+
+    # ------------------------------------------------------------ homing
+
+    def home(self, timeout_s: float) -> None:
+        """See Stage. The module's own reference search, as its axis parameter 193 says."""
+        self._begin("home")
+        self._position_lost()
+        if self.options.homing == "here":
+            self._ask(Command.STOP, phase="home")
+            self._until(lambda: self._get(Axis.SPEED, "home") == 0, timeout_s, "home")
+            self._set(Axis.TARGET, 0, "home")
+            self._set(Axis.POSITION, 0, "home")
+        else:
+            self._homing = True
+            try:
+                self._search(timeout_s)
+            finally:
+                self._homing = False
+        self._raw = self._get(Axis.POSITION, "home")
+        self._position = self._raw
+        self._at_ns = self.clock.now_ns()
+        self._homed = True
+        self._read("home")
+
+    def _search(self, timeout_s: float) -> None:
+        self._ask(Command.REFERENCE_SEARCH, 0, phase="home")
+        try:
+            self._until(
+                lambda: self._ask(Command.REFERENCE_SEARCH, 2, phase="home") == 0,
+                timeout_s,
+                "home",
+            )
+        except DeviceTimeout:
+            self._ask(Command.REFERENCE_SEARCH, 1, phase="home")
+            self._ask(Command.STOP, phase="home")
+            raise DeviceTimeout(
+                self.name,
+                "home",
+                f"the reference was not found within {timeout_s:g} s, and the search was stopped",
+                "check the reference switch and axis parameters 193 to 195",
+            ) from None
+
+    def _until(self, done: Callable[[], bool], timeout_s: float, phase: str) -> None:
+        deadline = self.clock.now_ns() + round(timeout_s * NS)
+        while not done():
+            if self.clock.now_ns() > deadline:
+                raise DeviceTimeout(self.name, phase, f"not done within {timeout_s:g} s")
+            self.clock.wait(POLL_S, self._halted)
+
+    def unlock(self) -> None:
+        """See Stage: TMCL has no alarm to leave."""
+        self._begin("unlock")
+        self._ask(Command.STOP, phase="unlock")
+        self._position_lost()
+
+    # ------------------------------------------------------------ motion
+
+    def move(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
+        """See Stage: the shorter way round to a point of the circle. Safe to send again."""
+        self._begin("move")
+        speed = self._speed("move", feed_mm_s)
+        (x, y), r = self.options.centre_mm, self.options.radius_mm
+        off = abs(math.hypot(x_mm - x, y_mm - y) - r)
+        if not off <= NEAR_MM:
+            near = self._arc.point(self._arc.angle((x_mm, y_mm)))
+            raise DeviceRefused(
+                self.name,
+                "move",
+                f"({x_mm:g}, {y_mm:g}) is {off:.3f} mm off the eccentric's circle of {r:g} mm "
+                f"about ({x:g}, {y:g})",
+                f"the nearest point is ({near[0]:.3f}, {near[1]:.3f})",
+            )
+        self._ready("move")
+        way = math.remainder(self._arc.angle((x_mm, y_mm)) - self._angle(), math.tau)
+        self._go(way, speed, "move")
+
+    def circle(self, centre_mm: Point, radius_mm: float, feed_mm_s: float, turns: float) -> None:
+        """See Stage: only the eccentric's own circle. Safe to send again. `turns` may be inf."""
+        self._begin("circle")
+        speed = self._speed("circle", feed_mm_s)
+        (x, y), r = self.options.centre_mm, self.options.radius_mm
+        if not (abs(radius_mm - r) <= NEAR_MM and math.dist(centre_mm, (x, y)) <= NEAR_MM):
+            raise DeviceRefused(
+                self.name,
+                "circle",
+                f"a circle of {radius_mm:g} mm about ({centre_mm[0]:g}, {centre_mm[1]:g})",
+                f"the eccentric goes round {r:g} mm about ({x:g}, {y:g}) only",
+            )
+        if not turns > 0:
+            raise DeviceRefused(self.name, "circle", f"{turns} turns were asked", "above 0")
+        self._ready("circle")
+        if math.isinf(turns):
+            self._run(_Motion(None, speed * self._sign()), "circle")
+            return
+        to_start = -self._angle() % math.tau
+        if math.tau - to_start < self._near_rad():
+            to_start = 0.0
+        self._go(to_start + turns * math.tau, speed, "circle")
+
+    def _near_rad(self) -> float:
+        return NEAR_MM / self.options.radius_mm
+
+    def _speed(self, phase: str, feed: float) -> int:
+        limit = self.options.max_feed_mm_s
+        if not 0 < feed <= limit:
+            raise DeviceRefused(
+                self.name, phase, f"a feed of {feed:g} mm/s", f"it takes up to {limit:g} mm/s"
+            )
+        if not self._turn:
+            return 1  # not connected: `_ready` says so
+        return max(1, round(feed / self._mm() / self._pps_unit))
+
+    def _ready(self, phase: str) -> None:
+        if not self._homed:
+            raise DeviceRefused(
+                self.name, phase, "its position is not known", "`umbra stage home` first"
+            )
+        if self._held and self._motion is not None:
+            raise DeviceRefused(self.name, phase, "it is held", "resume it or stop it first")
+        self._held = False
+        self._read(phase)
+
+    def _go(self, way_rad: float, speed: int, phase: str) -> None:
+        steps = round(self._sign() * way_rad / math.tau * self._turn)
+        if abs(steps) >= 2**31:
+            raise DeviceRefused(
+                self.name, phase, "more turns than the module counts", "ask for endless turns"
+            )
+        self._run(_Motion(self._raw + steps, speed), phase)
+
+    def _run(self, motion: _Motion, phase: str) -> None:
+        self._track.depart(self.clock.now_ns())
+        self._motion, self._held = motion, False
+        if motion.target is None:
+            turn = Command.ROTATE_RIGHT if motion.speed > 0 else Command.ROTATE_LEFT
+            self._ask(turn, 0, abs(motion.speed), phase=phase)
+        else:
+            self._set(Axis.MAX_SPEED, motion.speed, phase)
+            self._ask(Command.MOVE_TO, 0, _signed(motion.target), phase=phase)
+
+    def hold(self) -> None:
+        """See Stage. Safe to send again."""
+        self._begin("hold")
+        self._stand("hold")
+
+    def _stand(self, phase: str) -> None:
+        self._held = True
+        self._ask(Command.STOP, phase=phase)
+        self._until(lambda: self._get(Axis.SPEED, phase) == 0, 3.0, phase)
+        self._read(phase)
+
+    def resume(self) -> None:
+        """See Stage: to the same absolute target, so safe to send again."""
+        self._begin("resume")
+        self._held = False
+        if self._motion is not None and self._homed:
+            self._run(self._motion, "resume")
+
+    def stop(self) -> None:
+        """See Stage. The position stays known: a module counts while it decelerates."""
+        self._begin("stop")
+        self._stand("stop")
+        self._motion, self._held = None, False
+        self._read("stop")
+
+
+def _signed(steps: int) -> int:
+    """As the module's 32-bit counter shows it."""
+    return (steps + 2**31) % 2**32 - 2**31
+
+
+def checksum(data: bytes) -> int:
+    """The sum of the bytes, modulo 256."""
+    return sum(data) & 0xFF
+
+
+def encode(address: int, command: int, kind: int, motor: int, value: int) -> bytes:
+    """A request frame."""
+    body = struct.pack(">BBBBi", address, command, kind, motor, value)
+    return body + bytes([checksum(body)])
+
+
+def find_answer(data: bytes, address: int, command: int) -> tuple[int, int] | None:
+    """The last valid answer (status, value) of a module to a command, wherever it begins."""
+    for start in range(len(data) - FRAME, -1, -1):
+        frame = data[start : start + FRAME]
+        if frame[8] == checksum(frame[:8]) and frame[1] == address and frame[3] == command:
+            return frame[2], struct.unpack(">i", frame[4:8])[0]
+    return None

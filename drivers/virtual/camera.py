@@ -1,0 +1,456 @@
+"""A camera that looks at the virtual scene."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from drivers.base import (
+    Acquisition,
+    Camera,
+    CameraInfo,
+    CameraSettings,
+    Context,
+    DeviceRefused,
+    DeviceTimeout,
+    Frame,
+    Identity,
+    Options,
+    PixelFormat,
+)
+from drivers.clock import NS
+from drivers.virtual.device import VirtualDevice, VirtualOptions
+from drivers.virtual.faults import Fault
+from drivers.virtual.geometry import F32
+from drivers.virtual.timeline import Forgotten
+from drivers.virtual.transport import mosaic, pick, room
+from drivers.virtual.view import view
+
+CORRECT_US = 1e6 / 60  # with this exposure and no gain ...
+CORRECT_LEVEL = 0.8  # ... radiance 1 gives this part of the scale
+EXPOSURE_US = (20.0, 10e6)
+GAIN_DB = (0.0, 36.0)
+LUMINANCE = np.asarray((0.30, 0.59, 0.11), np.float32)  # a mono sensor's response
+
+
+class CameraOptions(VirtualOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Keys of ``[camera] driver = "virtual"``."""
+
+    width: Annotated[int, Meta(ge=32, le=8192)] = 640
+    height: Annotated[int, Meta(ge=32, le=8192)] = 480
+    pixel_format: PixelFormat = PixelFormat.BAYER_RG12
+    exposure_us: Annotated[float, Meta(ge=EXPOSURE_US[0], le=EXPOSURE_US[1])] = CORRECT_US
+    gain: Annotated[float, Meta(ge=GAIN_DB[0], le=GAIN_DB[1])] = 0.0  # dB
+    frame_rate_hz: Annotated[float, Meta(gt=0)] = 30.0  # free-running
+    trigger_latency_us: Annotated[float, Meta(ge=0)] = 50.0
+    readout_ms: Annotated[float, Meta(ge=0)] = 4.0
+    buffers: Annotated[int, Meta(ge=1, le=256)] = 8  # frames that wait in the driver
+    black_level: Annotated[float, Meta(ge=0)] | None = None  # counts; None: 1/64 of full scale
+    full_well_e: Annotated[float, Meta(gt=0)] = 10_500.0  # electrons at full scale without gain
+    read_noise_e: Annotated[float, Meta(ge=0)] = 3.0
+    noise: bool = True  # shot and read noise; rounding stays
+    ambient: Annotated[float, Meta(ge=0)] = 0.02  # radiance of white under the room's light
+    shake_px: Annotated[float, Meta(ge=0)] = 0.0  # sd of the picture's place, frame by frame
+    seed: Annotated[int, Meta(ge=0)] = 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Exposure:
+    sequence: int
+    start_ns: int
+    end_ns: int
+
+
+class VirtualCamera(VirtualDevice, Camera):
+    """A camera with a global shutter that integrates the light of the bench, frame by frame.
+
+    Software-triggered: an exposure begins `trigger_latency_us` after its trigger, or when the
+    sensor is free. Hardware-triggered: the same after each pulse on the bench's line, but a pulse
+    that finds the sensor exposing is not heard. Free-running: at `frame_rate_hz`. A frame that
+    finds none of the `buffers` free is lost, and its sequence number with it. Pixels are black
+    level + electrons x gain, with shot noise (its variance the electrons themselves) and read noise
+    from a generator seeded with `seed` and the number of the frame since the camera was made. A
+    frame whose light the bench has forgotten is `incomplete`. Gain in dB.
+
+    `configure`, `start`, `stop`, `safe` and `check` are safe to send again; `trigger` is not.
+    """
+
+    options_type = CameraOptions
+    main_act = "grab"
+
+    def __init__(self, name: str, options: Options, context: Context) -> None:
+        super().__init__(name, options, context)
+        assert isinstance(options, CameraOptions)
+        self._o = options
+        self._set = CameraSettings(
+            exposure_us=options.exposure_us,
+            gain=options.gain,
+            pixel_format=options.pixel_format,
+            frame_rate_hz=options.frame_rate_hz,
+            roi=(0, 0, options.width, options.height),
+        )
+        self._acquisition: Acquisition | None = None
+        self._waiting: deque[_Exposure] = deque()  # exposed or being exposed, not yet grabbed
+        self._heard = 0  # the last pulse on the trigger line that was looked at
+        self._wake = threading.Event()  # the pulses have changed, or it was halted
+        self._free = 0  # when the sensor can begin to expose
+        self._started = 0
+        self._next = 0  # sequence number
+        self._frames = 0  # since the camera was made: seeds the noise
+        self._last: tuple[NDArray[Any], Frame] | None = None
+
+    # ------------------------------------------------------------ settings
+
+    @property
+    def _exposure_us(self) -> float:
+        assert self._set.exposure_us is not None
+        return self._set.exposure_us
+
+    @property
+    def _gain(self) -> float:
+        assert self._set.gain is not None
+        return self._set.gain
+
+    @property
+    def _format(self) -> PixelFormat:
+        assert self._set.pixel_format is not None
+        return self._set.pixel_format
+
+    @property
+    def _roi(self) -> tuple[int, int, int, int]:
+        assert self._set.roi is not None
+        return self._set.roi
+
+    @property
+    def _black(self) -> float:
+        level = self._o.black_level
+        return self._format.full_scale // 64 if level is None else level
+
+    @property
+    def _period_ns(self) -> int:
+        """Between two frames: the sensor reads out a frame while it exposes the next."""
+        fastest = max(self._exposure_us * 1e3, self._o.readout_ms * 1e6)
+        if self._acquisition is Acquisition.FREE and self._set.frame_rate_hz:
+            return round(max(fastest, NS / self._set.frame_rate_hz))
+        return round(fastest)
+
+    def connect(self) -> Identity:
+        """See Device. The scene is built here, where no frame's deadline waits for it."""
+        identity = super().connect()
+        self.bench.prepare(self._o.width, self._o.height)
+        for layout in self._layouts():
+            _room(self._o.width, self._o.height, layout)
+        return identity
+
+    def info(self) -> CameraInfo:
+        """See Camera."""
+        fastest = max(self._exposure_us * 1e3, self._o.readout_ms * 1e6)
+        return CameraInfo(
+            self._roi[2],
+            self._roi[3],
+            self._format,
+            black_level=self._black,
+            exposure_range_us=EXPOSURE_US,
+            max_rate_hz=NS / fastest,
+            readout_s=self._o.readout_ms / 1e3,
+            triggers=("software", "hardware") if self.bench.line else ("software",),
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """See Device."""
+        return {
+            "virtual": True,
+            "full_well_e": self._o.full_well_e,
+            "read_noise_e": self._o.read_noise_e,
+            "seed": self._o.seed,
+        }
+
+    def settings(self) -> CameraSettings:
+        """See Camera."""
+        return self._set
+
+    def configure(self, wanted: CameraSettings) -> CameraSettings:
+        """See Camera."""
+        self._begin("configure")
+        if self._acquisition is not None:
+            raise self._refuse("configure", "it is acquiring", "stop it first")
+        given = {k: v for k, v in asdict(wanted).items() if v is not None}
+        new = replace(self._set, **given)
+        for value, (low, high), what in (
+            (new.exposure_us, EXPOSURE_US, "exposure in us"),
+            (new.gain, GAIN_DB, "gain in dB"),
+            (new.frame_rate_hz, (0.01, 1e4), "frame rate in Hz"),
+        ):
+            if value is None or not low <= value <= high:
+                raise self._refuse(
+                    "configure", f"{what} {value:g}", f"choose one from {low:g} to {high:g}"
+                )
+        assert new.roi is not None
+        assert new.pixel_format is not None
+        x, y, width, height = new.roi
+        fits = x >= 0 and y >= 0 and x + width <= self._o.width and y + height <= self._o.height
+        if not (fits and width > 0 and height > 0):
+            raise self._refuse(
+                "configure", f"roi {new.roi}", f"stay within {self._o.width} x {self._o.height}"
+            )
+        if new.pixel_format.bayer and (x % 2 or y % 2):
+            raise self._refuse("configure", f"roi {new.roi}", "a mosaic begins at even x and y")
+        self._set = new
+        return new
+
+    def _refuse(self, phase: str, problem: str, remedy: str) -> DeviceRefused:
+        return DeviceRefused(self.name, phase, problem, remedy)
+
+    # ------------------------------------------------------------ acquisition
+
+    def start(self, acquisition: Acquisition, at: int = 0) -> None:  # noqa: ARG002
+        """See Camera."""
+        self._begin("start")
+        line = self.bench.line
+        if acquisition is Acquisition.HARDWARE:
+            if line is None:
+                raise self._refuse(
+                    "start",
+                    "nothing on the bench sends it triggers",
+                    "use software triggers, or add a virtual projector",
+                )
+            with self.bench.lock:
+                line.listeners.add(self._wake)
+        self._waiting.clear()
+        self._acquisition = acquisition
+        self._next = 0
+        self._started = self._free = self._heard = self.clock.now_ns()
+
+    def trigger(self) -> tuple[int, int]:
+        """See Camera. A trigger that comes before the sensor is free waits for it."""
+        if self._acquisition is not Acquisition.SOFTWARE:
+            raise self._refuse("trigger", "it waits for no trigger", "start it with SOFTWARE")
+        kinds = self._begin("trigger")
+        start = self.clock.now_ns() + round(self._o.trigger_latency_us * 1e3)
+        start = max(start, self._free)
+        end = start + round(self._exposure_us * 1e3)
+        if Fault.DROP_TRIGGER not in kinds:
+            self._free = max(end, start + self._period_ns)
+            self._queue(start, end)
+        return start, end
+
+    def _queue(self, start: int, end: int) -> None:
+        if len(self._waiting) < self._o.buffers:
+            self._waiting.append(_Exposure(self._next, start, end))
+        self._next += 1  # without a free buffer the frame is lost, its number used up
+
+    def halt(self) -> None:
+        """See Device."""
+        super().halt()
+        self._wake.set()
+
+    def _await_pulse(self, deadline_ns: int) -> None:
+        """Wait until a pulse has begun an exposure, for a halt, or for the deadline."""
+        while not self._waiting:
+            self._wake.clear()
+            if self._halted.is_set():
+                return
+            planned = self._listen()
+            if self._waiting or self.clock.now_ns() >= deadline_ns:
+                return
+            until = deadline_ns if planned is None else min(planned, deadline_ns)
+            self.clock.wait_until(until, self._wake)
+
+    def _listen(self) -> int | None:
+        """Expose for each pulse up to now; gives the next one that is planned."""
+        line = self.bench.line
+        assert line is not None
+        with self.bench.lock:
+            now = self.clock.now_ns()
+            while (pulse := line.after(self._heard)) is not None and pulse <= now:
+                self._heard = pulse
+                start = pulse + round(self._o.trigger_latency_us * 1e3)
+                missed = Fault.DROP_TRIGGER in self.faults.strike("trigger", self._halted)
+                if missed or start < self._free:
+                    continue
+                end = start + round(self._exposure_us * 1e3)
+                self._free = start + self._period_ns
+                self._queue(start, end)
+            return pulse
+
+    def _run(self) -> None:
+        """Expose all that a free-running camera has exposed by now, and the one in the making;
+        the next one, if there is no other to wait for."""
+        period, exposure = self._period_ns, round(self._exposure_us * 1e3)
+        due = (self.clock.now_ns() - self._started) // period
+        while not self._waiting or (self._next <= due and len(self._waiting) < self._o.buffers):
+            start = self._started + self._next * period
+            self._queue(start, start + exposure)
+        self._next = max(self._next, due)
+
+    def grab(self, out: NDArray[Any], timeout_s: float) -> Frame:
+        """See Camera."""
+        if self._acquisition is None:
+            raise self._refuse("grab", "it is not acquiring", "start it first")
+        shape, dtype = self.info().shape, self._format.dtype
+        if out.shape != shape or out.dtype != dtype:
+            raise self._refuse(
+                "grab", f"a buffer of {out.shape} {out.dtype}", f"give {shape} {dtype}"
+            )
+        kinds = self._begin("grab", timeout_s)
+        if Fault.DUPLICATE_FRAME in kinds and self._last is not None:
+            out[...] = self._last[0]
+            return replace(self._last[1], pixels=out)
+        deadline = self.clock.now_ns() + round(timeout_s * NS)
+        if self._acquisition is Acquisition.FREE:
+            self._run()
+        elif self._acquisition is Acquisition.HARDWARE:
+            self._await_pulse(deadline)
+        if not self._waiting:
+            halted = self.clock.wait_until(deadline, self._halted)
+            raise self._late(halted, timeout_s, "was it triggered?")
+        exposure = self._waiting[0]
+        there = exposure.end_ns + round(self._o.readout_ms * 1e6)
+        halted = self.clock.wait_until(min(there, deadline), self._halted)
+        if halted or there > deadline:
+            raise self._late(halted, timeout_s, "allow for the exposure and the readout")
+        self._waiting.popleft()
+        complete = self._expose(exposure, out)
+        if Fault.INCOMPLETE_FRAME in kinds:
+            out[shape[0] // 2 :] = 0
+            complete = False
+        utc = self.clock.utc_ns() - self.clock.now_ns() + exposure.start_ns
+        frame = Frame(
+            out,
+            exposure.sequence,
+            exposure.start_ns,
+            exposure.end_ns,
+            utc,
+            self._exposure_us,
+            self._gain,
+            incomplete=not complete,
+        )
+        self._last = (out.copy(), frame)
+        return frame
+
+    def _late(self, halted: bool, timeout_s: float, remedy: str) -> DeviceTimeout:
+        problem = "halted" if halted else f"no frame within {timeout_s:g} s"
+        return DeviceTimeout(self.name, "grab", problem, remedy)
+
+    def stop(self) -> None:
+        """See Camera."""
+        self._begin("stop")
+        self._end()
+
+    def safe(self) -> None:
+        """See Device: stopped."""
+        self._begin("safe")
+        self._end()
+
+    def close(self) -> None:
+        """See Device."""
+        self._connected = False
+        self._end()
+
+    def _end(self) -> None:
+        self._acquisition = None
+        self._waiting.clear()
+        self._last = None
+        if self.bench.line is not None:
+            with self.bench.lock:
+                self.bench.line.listeners.discard(self._wake)
+
+    # ------------------------------------------------------------ light to counts
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self._o.width, self._o.height
+
+    def _counts(self) -> float:
+        """Counts above black for radiance 1."""
+        scale = self._format.full_scale - self._black
+        exposed = self._exposure_us / CORRECT_US * 10 ** (self._gain / 20)
+        return CORRECT_LEVEL * exposed * scale
+
+    def _layouts(self) -> tuple[str, ...]:
+        return (self._format.bayer,) if self._format.bayer else ("R", "G", "B")
+
+    def _sensor(self, planes: list[F32]) -> F32:
+        """Planes of `_layouts` as the pixels of this format, within the ROI."""
+        if self._format.bayer:
+            picture = planes[0]
+        else:
+            picture = np.stack(planes, -1)
+            if self._format.channels == 1:
+                picture = np.asarray(picture @ LUMINANCE, np.float32)
+        x, y, width, height = self._roi
+        return picture[y : y + height, x : x + width]
+
+    def _light(self, start_ns: int, end_ns: int, rng: np.random.Generator) -> list[F32]:
+        """Mean radiance, one plane a layout. Raises Forgotten."""
+        dx, dy = rng.normal(0, self._o.shake_px, 2) if self._o.shake_px else (0.0, 0.0)
+        still = not (dx or dy)
+        layouts = self._layouts() if still else ("R", "G", "B")
+        planes = self.bench.radiance(start_ns, end_ns, self._size, layouts)
+        if self._o.ambient:
+            for k, layout in enumerate(layouts):
+                planes[k] += np.float32(self._o.ambient) * _room(*self._size, layout)
+        if still:
+            return planes
+        shift = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
+        moved = [
+            np.asarray(
+                cv2.warpAffine(p, shift, self._size, borderMode=cv2.BORDER_REPLICATE), np.float32
+            )
+            for p in planes
+        ]
+        if not self._format.bayer:
+            return moved
+        return [pick(np.stack(moved, -1), mosaic(self._format.bayer, moved[0].shape))]
+
+    def _expose(self, exposure: _Exposure, out: NDArray[Any]) -> bool:
+        """Fill `out` with the counts of an exposure that is over; False: its light is forgotten."""
+        rng = np.random.Generator(np.random.SFC64([self._o.seed, self._frames]))
+        self._frames += 1
+        try:
+            planes = self._light(exposure.start_ns, exposure.end_ns, rng)
+        except Forgotten:
+            out[...] = 0
+            return False
+        counts = self._sensor(planes) * np.float32(self._counts())
+        if self._o.noise:
+            amplified = 10 ** (self._gain / 20)
+            per_electron = (self._format.full_scale - self._black) / self._o.full_well_e * amplified
+            variance = counts * np.float32(per_electron)
+            variance += np.float32((self._o.read_noise_e * per_electron) ** 2)
+            noise = rng.standard_normal(counts.shape, np.float32)
+            noise *= np.sqrt(variance, out=variance)
+            counts += noise
+        counts += np.float32(self._black + 0.5)
+        np.clip(counts, 0, self._format.full_scale + 0.5, out=counts)
+        out[...] = counts  # truncated: the half above makes it rounding
+        return True
+
+    def truth(self, sources: tuple[str, ...] = ()) -> dict[str, NDArray[np.float32]]:
+        """See Camera; of the projector, or of the named sources of the bench."""
+        names = sources or self.bench.main_sources()
+        if not names:
+            return {}
+        direct, others = self.bench.components(names, self._size, ("R", "G", "B"))
+        mosaicked = bool(self._format.bayer)
+        parts = {}
+        for name, planes in (("direct", direct), ("global", others)):
+            picture = np.stack(planes, -1)
+            if self._format.channels == 1 and not mosaicked:
+                picture = np.asarray(picture @ LUMINANCE, np.float32)
+            x, y, width, height = self._roi
+            parts[name] = picture[y : y + height, x : x + width] * np.float32(self._counts())
+        return parts
+
+
+@lru_cache(maxsize=8)
+def _room(width: int, height: int, layout: str) -> F32:
+    return room(view(width, height), layout)

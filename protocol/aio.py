@@ -1,0 +1,398 @@
+"""The asyncio client: ``async with AsyncClient() as rig: run = await rig.scan(Checkerboard())``.
+
+The same commands, retries and errors as the blocking client's. Requests may overlap: each answer
+finds its own by id. A cancelled request is forgotten; its late answer is passed over.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+import weakref
+from collections import deque
+from collections.abc import AsyncGenerator, AsyncIterator
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import zmq
+import zmq.asyncio
+
+from protocol.arrivals import arrival, place_for, place_in
+from protocol.client import chosen_keys, own_name
+from protocol.commands import Commands
+from protocol.connection import (
+    ATTEMPTS,
+    Ask,
+    Exchange,
+    Inbox,
+    Notice,
+    chosen_endpoint,
+    dealer,
+    events_endpoint,
+    id_of,
+    split_topics,
+    subscriber,
+    unreachable,
+)
+from protocol.errors import Code, UmbraError
+from protocol.following import SILENCE_S, Following
+from protocol.keys import ClientKeys
+from protocol.messages import Progress, RunInfo, RunState, Welcome
+from protocol.results import Separation
+from protocol.run import described, failure
+from protocol.scans import AnyScan
+
+T = TypeVar("T")
+log = logging.getLogger("umbra")
+
+
+class AsyncClient(Commands):
+    """A connection to a rig, with a coroutine for each command. For one loop."""
+
+    welcome: Welcome
+
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        *,
+        keys: ClientKeys | Path | str | Literal[False] | None = None,
+        timeout_s: float = 5.0,
+        name: str = "",
+    ) -> None:
+        self.endpoint = chosen_endpoint(endpoint)
+        self.keys = chosen_keys(keys, self.endpoint)
+        self.timeout_s = timeout_s
+        self.name = name or own_name()
+        self.token = ""  # of the lock, while this client holds it
+        self._context = zmq.asyncio.Context()
+        self._streams: weakref.WeakSet[AsyncEventStream] = weakref.WeakSet()
+        self._lines: list[_Line] = []
+        self._waiting: dict[str, asyncio.Future[list[zmq.Frame]]] = {}
+
+    # -------------------------------------------------------- life
+
+    async def open(self) -> AsyncClient:
+        """Connect, with the version check. Raises UmbraError."""
+        try:
+            self.welcome = await self.hello()
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def close(self) -> None:
+        """Let go of the rig; what runs there goes on. Requests under way end in UNREACHABLE."""
+        for future in self._waiting.values():
+            if not future.done():
+                future.set_exception(_closed())
+        await self._retire(keep=0)
+        for stream in list(self._streams):
+            stream.close()
+        self._context.destroy(linger=0)
+
+    async def __aenter__(self) -> AsyncClient:
+        return await self.open()
+
+    async def __aexit__(self, *error: object) -> None:
+        await self.close()
+
+    def __repr__(self) -> str:
+        state = " (closed)" if self._context.closed else ""
+        return f"<AsyncClient of {self.endpoint}{state}>"
+
+    # -------------------------------------------------------- one request
+
+    async def perform(self, ask: Ask[T]) -> T:
+        """Ask, wait, repeat: what the answer says. Raises UmbraError."""
+        exchange = Exchange(ask, self.token)
+        whole = max(self.timeout_s, ask.timeout_s)
+        begun = time.monotonic()
+        future = asyncio.get_running_loop().create_future()
+        self._waiting[exchange.id] = future
+        try:
+            for attempt in range(1, ATTEMPTS + 1):
+                until = begun + whole * attempt / ATTEMPTS
+                line = self._line(fresh=attempt > 1)
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(max(0.0, until - time.monotonic())):
+                        await line.send(exchange)
+                        return exchange.value(await asyncio.shield(future))
+            raise unreachable(self.endpoint, whole, self.keys)
+        finally:
+            future.cancel()
+            del self._waiting[exchange.id]
+            if not self._waiting:
+                await self._retire(keep=1)
+
+    async def _retire(self, *, keep: int) -> None:
+        """Close all lines but the newest."""
+        old, self._lines = (
+            self._lines[: len(self._lines) - keep],
+            self._lines[len(self._lines) - keep :],
+        )
+        for line in old:
+            await line.close()
+
+    def _line(self, *, fresh: bool) -> _Line:
+        if self._context.closed:
+            raise _closed()
+        if fresh or not self._lines:
+            socket = dealer(self._context, self.endpoint, self.keys)
+            self._lines.append(_Line(socket, self._waiting))
+        return self._lines[-1]
+
+    # -------------------------------------------------------- runs
+
+    async def scan(self, spec: AnyScan, *, first: bool = False) -> AsyncRun:
+        """Queue a scan and hand back its run, at once."""
+        return AsyncRun(self, await self.submit(spec, first=first))
+
+    async def run(self, run: str = "") -> AsyncRun:
+        """A handle on a run; "" is the current or else the newest."""
+        return AsyncRun(self, await self.run_info(run))
+
+    async def download(self, run: str, name: str, to: Path | str) -> Path:
+        """Fetch a product's file to a path, or into a folder; the file appears when it is whole."""
+        part = await self.product_part(run, name)
+        path, size = place_for(to, part.product), part.size
+        with arrival(path) as file:
+            while True:
+                await asyncio.to_thread(file.write, part.data)
+                done = part.offset + len(part.data)
+                if done >= size or not part.data:
+                    break
+                part = await self.product_part(run, name, offset=done)
+            await asyncio.to_thread(file.finish, size)
+        return path
+
+    # -------------------------------------------------------- events
+
+    def subscribe(self, *topics: str) -> AsyncEventStream:
+        """The rig's events as they come: run, progress, queue, device, rig, preview.
+
+        No topic means all but previews. Close it, or use it as a context manager.
+        """
+        endpoint = events_endpoint(self.welcome, self.endpoint)
+        stream = AsyncEventStream(
+            [
+                subscriber(self._context, endpoint, self.keys, names, hwm)
+                for names, hwm in split_topics(topics)
+            ]
+        )
+        self._streams.add(stream)
+        return stream
+
+    # -------------------------------------------------------- the lock
+
+    @contextlib.asynccontextmanager
+    async def hold(
+        self, owner: str = "", note: str = "", lease_s: float = 10.0
+    ) -> AsyncIterator[None]:
+        """Hold the rig for manual work: ``async with rig.hold("me", note="focusing"): ...``.
+
+        A task renews the lock three times a lease. Where that fails the rig goes to its safe
+        state, and the error is raised at the end of the block.
+        """
+        locked = await self.lock(owner or self.name, note, lease_s)
+        self.token = locked.token
+        lost: UmbraError | None = None
+
+        async def beat() -> None:
+            nonlocal lost
+            try:
+                while True:
+                    await asyncio.sleep(locked.lease_s / 3)
+                    await self.renew_lock()
+            except UmbraError as error:
+                log.warning("the rig's lock is lost: %s", error)
+                lost = UmbraError(error.code, f"the rig's lock was lost: {error}", error.where)
+
+        heartbeat = asyncio.create_task(beat())
+        try:
+            yield
+        finally:
+            heartbeat.cancel()
+            await asyncio.wait([heartbeat])
+            try:
+                if lost is None:
+                    await self.unlock()
+            finally:
+                self.token = ""
+        if lost is not None:
+            raise lost
+
+
+def _closed() -> UmbraError:
+    return UmbraError(Code.UNREACHABLE, "this client is closed: connect again")
+
+
+class _Line:
+    """A DEALER socket and the task that hands its answers to those who wait."""
+
+    def __init__(
+        self,
+        socket: zmq.asyncio.Socket,
+        waiting: dict[str, asyncio.Future[list[zmq.Frame]]],
+    ) -> None:
+        self._socket = socket
+        self._waiting = waiting
+        self._reader = asyncio.create_task(self._read())
+
+    async def send(self, exchange: Exchange[T]) -> None:
+        """Send as soon as there is a connection."""
+        await self._socket.send_multipart(exchange.message)
+
+    async def _read(self) -> None:
+        while True:
+            frames = await self._socket.recv_multipart(copy=False)
+            future = self._waiting.get(id_of(frames))
+            if future is not None and not future.done():
+                future.set_result(frames)
+
+    async def close(self) -> None:
+        self._reader.cancel()
+        await asyncio.wait([self._reader])
+        self._socket.close()
+
+
+class AsyncEventStream:
+    """Events, one after the other; made by `AsyncClient.subscribe`."""
+
+    def __init__(self, sockets: list[zmq.asyncio.Socket]) -> None:
+        self._sockets = sockets
+        self._inbox = Inbox()
+        self._waiting: deque[Notice] = deque()
+
+    async def next(self, timeout_s: float | None = None) -> Notice | None:
+        """The next event, or None after `timeout_s` without one and when the stream is closed."""
+        until = None if timeout_s is None else time.monotonic() + timeout_s
+        poller = zmq.asyncio.Poller()
+        for socket in self._sockets:
+            poller.register(socket, zmq.POLLIN)
+        while not self._waiting:
+            if any(socket.closed for socket in self._sockets):
+                return None
+            left = None if until is None else until - time.monotonic()
+            if left is not None and left <= 0:
+                return None
+            await poller.poll(None if left is None else max(1, int(left * 1000)))
+            self._waiting.extend(self._inbox.take(await self._drained()))
+        return self._waiting.popleft()
+
+    async def _drained(self) -> list[list[zmq.Frame]]:
+        messages = []
+        for socket in self._sockets:
+            with contextlib.suppress(zmq.Again):
+                while True:
+                    messages.append(await socket.recv_multipart(zmq.NOBLOCK, copy=False))
+        return messages
+
+    def __aiter__(self) -> AsyncEventStream:
+        return self
+
+    async def __anext__(self) -> Notice:
+        notice = await self.next()
+        if notice is None:
+            raise StopAsyncIteration
+        return notice
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        for socket in self._sockets:
+            socket.close()
+
+    async def __aenter__(self) -> AsyncEventStream:
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        self.close()
+
+
+class AsyncRun:
+    """A run on a rig: follow it, steer it, fetch what it made. `info` is as last heard."""
+
+    def __init__(self, rig: AsyncClient, info: RunInfo) -> None:
+        self._rig = rig
+        self.info = info
+
+    @property
+    def id(self) -> str:
+        """The run's id."""
+        return self.info.id
+
+    @property
+    def state(self) -> RunState:
+        """The run's state as last heard; `refresh` asks."""
+        return self.info.state
+
+    async def refresh(self) -> RunInfo:
+        """Ask the rig how the run is."""
+        self.info = await self._rig.run_info(self.id)
+        return self.info
+
+    async def progress(self) -> AsyncGenerator[Progress, None]:
+        """How the run goes on, until it has ended: see `protocol.run.Run.progress`."""
+        following = Following(self.id)
+        async with self._rig.subscribe("run", "progress") as events:
+            news = await self._snapshot(following)
+            while True:
+                if news is not None:
+                    yield news
+                if following.ended:
+                    break
+                notice = await events.next(SILENCE_S)
+                if notice is None or following.outdated_by(notice.event):
+                    news = await self._snapshot(following)
+                else:
+                    news = following.event(notice.event)
+        await self.refresh()
+
+    async def _snapshot(self, following: Following) -> Progress | None:
+        status = await self._rig.status()
+        return following.snapshot(status, await self.refresh())
+
+    async def wait(self, timeout_s: float | None = None, *, check: bool = True) -> RunInfo:
+        """Wait until the run has ended: see `protocol.run.Run.wait`."""
+        try:
+            async with asyncio.timeout(timeout_s), contextlib.aclosing(self.progress()) as going:
+                async for _ in going:
+                    pass
+        except TimeoutError:
+            raise TimeoutError(f"run {self.id} is {self.state} after {timeout_s:g} s") from None
+        if check and self.state is not RunState.DONE:
+            raise failure(self.info)
+        return self.info
+
+    async def result(self, *, check: bool = True) -> Separation:
+        """Direct and global as they are now: see `protocol.run.Run.result`."""
+        if check and (await self.refresh()).state is RunState.FAILED:
+            raise failure(self.info)
+        return await self._rig.result(self.id)
+
+    async def facts(self) -> dict[str, Any]:
+        """The figures of the run as they are now: see `protocol.run.Run.facts`."""
+        return await self._rig.facts(self.id)
+
+    async def save(self, folder: Path | str) -> list[Path]:
+        """Fetch all products into a folder, which is made; the files written."""
+        return [
+            await self._rig.download(self.id, product.name, place_in(folder, product))
+            for product in (await self.refresh()).products
+        ]
+
+    async def pause(self) -> None:
+        """Pause after the step under way."""
+        await self._rig.pause(self.id)
+
+    async def resume(self) -> None:
+        """Go on."""
+        await self._rig.resume(self.id)
+
+    async def abort(self) -> None:
+        """End the run; what was recorded is kept."""
+        await self._rig.abort(self.id)
+
+    def __repr__(self) -> str:
+        return f"<AsyncRun {described(self.info)}>"

@@ -1,0 +1,5 @@
+"""`python -m protocol.cli` is `umbra`."""
+
+from protocol.cli.app import main
+
+main()

@@ -1,0 +1,131 @@
+"""`umbra separate`: photographs that were taken already, through the same daemon and pipeline."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from protocol.cli.delivery import Delivery
+from protocol.cli.family import tag_option
+from protocol.cli.link import Json
+from protocol.cli.methods import METHODS, spec_of, union_options
+from protocol.cli.options import with_options
+from protocol.cli.output import print_json, say
+from protocol.cli.private import private_daemon
+from protocol.cli.runs import Force, fetch, wanted
+from protocol.cli.watch import follow, must_be_done
+from protocol.cli.words import Fetched, frames
+from protocol.errors import Code, UmbraError
+from protocol.messages import Health, RunInfo
+from protocol.scans import AnySeparation, Reference
+
+if TYPE_CHECKING:
+    from protocol.client import Client
+
+LIVE = {"exposure_us", "gain", "references"}
+"""Fields that are no options here: the photographs have them, or the files given say them."""
+OPTIONS = union_options(METHODS, without=LIVE)
+
+
+class Bayer(enum.StrEnum):
+    """The upper left corner of a colour mosaic."""
+
+    RG = "RG"
+    GR = "GR"
+    GB = "GB"
+    BG = "BG"
+
+
+def _frame(what: str) -> Any:
+    return typer.Option(metavar="FILE", help=f"A photograph of the scene {what}.")
+
+
+def _separate(
+    *,
+    source: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A folder of images in natural order, or a video.")
+    ],
+    method: Annotated[
+        str, tag_option(AnySeparation, "-m", "--method", help_text="How the scene was lit.")
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="OUT", help="Folder for the products.")
+    ],
+    black_frame: Annotated[Path | None, _frame("with the projector showing black")] = None,
+    white_frame: Annotated[Path | None, _frame("with the projector showing white")] = None,
+    ambient_frame: Annotated[Path | None, _frame("with the source off")] = None,
+    bayer: Annotated[
+        Bayer | None, typer.Option(help="The images are a raw colour mosaic that begins so.")
+    ] = None,
+    match: Annotated[
+        str, typer.Option(metavar="GLOB", help="Which of the folder's names are frames.")
+    ] = "*",
+    force: Force = False,
+    as_json: Json = False,
+    **given: Any,
+) -> None:
+    """Separate photographs or a video that you already have into direct and global light.
+
+    OUT gets direct.tiff and global.tiff (float32, linear, RGB), quality, preview and report: all
+    of them, or nothing if anything is wrong.
+
+    --json: {"run": RunInfo, "files": [path, ...]}.
+    """
+    shots = {
+        Reference.BLACK: black_frame,
+        Reference.WHITE: white_frame,
+        Reference.AMBIENT: ambient_frame,
+    }
+    first = {kind: file.absolute() for kind, file in shots.items() if file is not None}
+    spec = spec_of(method, given, references=list(first))
+    delivery = Delivery(out, force=force)
+    delivery.check()
+    for file in (source, *first.values()):
+        if not file.exists():
+            raise UmbraError(Code.BAD_INPUT, f"{file} does not exist")
+    config = {
+        "camera": {
+            "driver": "replay",
+            "path": str(source.absolute()),
+            "first": [str(file) for file in first.values()],
+            "match": match,
+            "bayer": bayer.value if bayer else None,
+        },
+        # the photographs are the originals: no second copy of them
+        "storage": {"keep_frames": False, "reserve_mb": 0},
+    }
+    try:
+        with private_daemon(config) as client:
+            usable(client)
+            run = client.scan(spec)
+            follow(run, title=f"{source.name or source} {method}")
+            must_be_done(run.info)
+            files = fetch(client, run.info, delivery, wanted(run.info, ""))
+    except KeyboardInterrupt:
+        say(f"\numbra: stopped; nothing was written to {out}")
+        raise
+    report(run.info, files, as_json)
+
+
+def usable(client: Client) -> None:
+    """Raise UmbraError(bad_input) with the camera's own words if it cannot read its recording."""
+    for device in client.devices():
+        if device.health is not Health.READY:
+            raise UmbraError(Code.BAD_INPUT, device.message.removeprefix("camera: connect: "))
+
+
+def report(info: RunInfo, files: Iterable[Path], as_json: bool) -> None:
+    """Say what was written."""
+    if as_json:
+        print_json(Fetched(run=info, files=tuple(map(str, files))))
+        return
+    say(f"separated {frames(info)}")
+    for file in files:
+        print(file)
+
+
+separate = with_options(_separate, [option.parameter() for option in OPTIONS])

@@ -1,0 +1,71 @@
+"""How runs are put into words."""
+
+from __future__ import annotations
+
+import msgspec
+
+from protocol.cli.output import when
+from protocol.messages import Fact, RunInfo
+
+
+def method(run: RunInfo) -> str:
+    """The name of the run's method."""
+    return str(type(run.spec).__struct_config__.tag)
+
+
+def frames(run: RunInfo) -> str:
+    """How many frames: 12/27 frames, 1 missing."""
+    told = f"{run.recorded}/{run.planned} frames" if run.planned else f"{run.recorded} frames"
+    if run.missing:
+        told += f", {run.missing} missing"
+    if run.rejected:
+        told += f", {run.rejected} rejected"
+    return told
+
+
+def settings(run: RunInfo) -> str:
+    """What the run was told that is not a default: checker=6, radiometry.tone=srgb."""
+
+    def changed(spec: msgspec.Struct, before: str) -> list[str]:
+        found = []
+        for field in msgspec.structs.fields(spec):
+            value = getattr(spec, field.name)
+            if value == field.default:
+                continue
+            if isinstance(value, msgspec.Struct):
+                found += changed(value, f"{field.name}.")
+            else:
+                found.append(f"{before}{field.name}={_plain(value)}")
+        return found
+
+    return ", ".join(changed(run.spec, ""))
+
+
+def _plain(value: object) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def ending(run: RunInfo) -> str:
+    """Why it ended, if that needs words."""
+    if run.end is None:
+        return ""
+    by = f" by {run.end.by}" if run.end.by and run.end.by not in run.end.reason else ""
+    return f"{run.end.reason}{by}"
+
+
+def rows(runs: tuple[RunInfo, ...]) -> list[list[str]]:
+    """Runs as rows of a table; see HEADINGS."""
+    return [
+        [r.id, method(r), r.state.value, frames(r), when(r.submitted), r.spec.note or ending(r)]
+        for r in runs
+    ]
+
+
+HEADINGS = ["run", "method", "state", "frames", "submitted", "note"]
+
+
+class Fetched(Fact, frozen=True, kw_only=True):
+    """What `--json` prints when files were written: the run, and the files."""
+
+    run: RunInfo
+    files: tuple[str, ...]

@@ -1,0 +1,293 @@
+"""Every command as a typed method, written once for both clients.
+
+A method here says what to send and what the answer becomes. `Client` has it as a blocking call,
+`AsyncClient` as a coroutine: `command` binds it to either.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Coroutine
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Concatenate,
+    Generic,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    cast,
+    overload,
+)
+
+from protocol import messages as m
+from protocol.connection import Ask, checked, expect
+from protocol.messages import CameraSettings, RunInfo, RunState
+from protocol.patterns import AnyPattern
+from protocol.results import (
+    Part,
+    Picture,
+    Separation,
+    facts_of,
+    message_of,
+    part_of,
+    picture_of,
+    run_of,
+    runs_of,
+    separation_of,
+    stage_of,
+)
+from protocol.scans import AnyScan
+
+if TYPE_CHECKING:
+    from protocol.aio import AsyncClient
+    from protocol.client import Client
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+SLOW_S = 30.0
+"""The least time-out of a command whose own work takes time: an exposure, a large array."""
+
+
+class command(Generic[P, T]):  # noqa: N801  (a decorator, as property is)
+    """Makes a function that returns an Ask into a method of both clients."""
+
+    def __init__(self, make: Callable[Concatenate[Any, P], Ask[T]]) -> None:
+        functools.update_wrapper(cast("Any", self), make)
+        self._make = make
+
+    @overload
+    def __get__(self, rig: None, owner: type) -> Callable[Concatenate[Any, P], Ask[T]]: ...
+    @overload
+    def __get__(self, rig: Client, owner: type) -> Callable[P, T]: ...
+    @overload
+    def __get__(self, rig: AsyncClient, owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
+    def __get__(self, rig: Any, owner: type) -> Any:
+        if rig is None:
+            return self._make
+
+        @functools.wraps(self._make)
+        def call(*args: P.args, **kwargs: P.kwargs) -> Any:
+            return rig.perform(self._make(rig, *args, **kwargs))
+
+        call.__signature__ = _bound(self._make)  # type: ignore[attr-defined]
+        return call
+
+
+@functools.cache
+def _bound(make: Callable[..., Any]) -> inspect.Signature:
+    """The signature that a person sees: without self, and with what comes back."""
+    whole = inspect.signature(make)
+    back = str(whole.return_annotation).removeprefix("Ask[").removesuffix("]")
+    return whole.replace(parameters=list(whole.parameters.values())[1:], return_annotation=back)
+
+
+# ---------------------------------------------------------------- the commands
+
+
+class Commands:
+    """The methods that both clients have. Each raises UmbraError with the daemon's reason.
+
+    `run` is a run's id; "" means the current run (or, to read, else the newest).
+    """
+
+    name: str  # who asks, for the rig's records
+
+    @command
+    def hello(self) -> Ask[m.Welcome]:
+        """Who is there, with the version check; done on connecting."""
+        return Ask(m.Hello(client=self.name), lambda a: checked(expect(a.reply, m.Welcome)))
+
+    @command
+    def status(self) -> Ask[m.Status]:
+        """Everything that changes, now: rig, devices, current run, queue, lock, free space."""
+        return Ask(m.GetStatus(), lambda a: expect(a.reply, m.Status))
+
+    @command
+    def devices(self) -> Ask[tuple[m.DeviceInfo, ...]]:
+        """The devices in detail."""
+        return Ask(m.GetDevices(), lambda a: expect(a.reply, m.Devices).devices)
+
+    @command
+    def discover(self, *drivers: str, timeout_s: float = 15.0) -> Ask[tuple[m.Search, ...]]:
+        """What is attached, asked of the drivers named, or of all. They broadcast on networks."""
+        return Ask(
+            m.Discover(drivers=drivers, timeout_s=timeout_s),
+            lambda a: expect(a.reply, m.Discovered).searches,
+            timeout_s + SLOW_S,
+        )
+
+    @command
+    def submit(self, spec: AnyScan, *, first: bool = False) -> Ask[RunInfo]:
+        """Queue a scan, ahead of the others if `first`; comes back at once. `scan` gives a Run."""
+        return Ask(m.Submit(spec=spec, by=self.name, first=first), run_of)
+
+    @command
+    def queue(self) -> Ask[tuple[RunInfo, ...]]:
+        """The runs that wait, in order."""
+        return Ask(m.GetQueue(), runs_of)
+
+    @command
+    def move_queued(self, run: str, to: int) -> Ask[tuple[RunInfo, ...]]:
+        """Put a waiting run at another place in the queue (0 is next)."""
+        return Ask(m.MoveQueued(run=run, to=to), runs_of)
+
+    @command
+    def pause(self, run: str = "") -> Ask[RunInfo]:
+        """Pause a run after the step under way: projector dark, stage held."""
+        return Ask(m.Pause(run=run), run_of)
+
+    @command
+    def resume(self, run: str = "") -> Ask[RunInfo]:
+        """Go on with a paused run, or queue an interrupted one where it stopped."""
+        return Ask(m.Resume(run=run), run_of)
+
+    @command
+    def abort(self, run: str = "") -> Ask[RunInfo]:
+        """End a run and go to the safe state; what was recorded is kept."""
+        return Ask(m.Abort(run=run, by=self.name), run_of)
+
+    @command
+    def estop(self) -> Ask[str]:
+        """Safe state now; everything is refused until `reset`."""
+        return Ask(m.EStop(by=self.name), message_of)
+
+    @command
+    def reset(self) -> Ask[str]:
+        """End an emergency stop."""
+        return Ask(m.Reset(), message_of)
+
+    @command
+    def runs(self, limit: int = 50, state: RunState | None = None) -> Ask[tuple[RunInfo, ...]]:
+        """Runs, the newest first."""
+        return Ask(m.ListRuns(limit=limit, state=state), runs_of)
+
+    @command
+    def run_info(self, run: str = "") -> Ask[RunInfo]:
+        """What is known of one run; `run` gives a handle on it."""
+        return Ask(m.GetRun(run=run), run_of)
+
+    @command
+    def result(self, run: str = "") -> Ask[Separation]:
+        """Direct and global, final or so far."""
+        return Ask(m.GetResult(run=run), separation_of, SLOW_S)
+
+    @command
+    def facts(self, run: str = "") -> Ask[dict[str, Any]]:
+        """The figures of a run, final or so far: of a separation quality.json's, else its own."""
+        return Ask(m.GetResult(run=run), facts_of, SLOW_S)
+
+    @command
+    def product_part(self, run: str, name: str, offset: int = 0, limit: int = 8 << 20) -> Ask[Part]:
+        """A part of a product's file; `download` fetches a whole one."""
+        return Ask(m.GetProduct(run=run, name=name, offset=offset, limit=limit), part_of, SLOW_S)
+
+    @command
+    def log(self, run: str = "", limit: int = 200) -> Ask[tuple[dict[str, Any], ...]]:
+        """The last log records of a run, or ("") of the daemon; the oldest first."""
+        return Ask(m.GetLog(run=run, limit=limit), lambda a: expect(a.reply, m.Log).records)
+
+    @command
+    def preview(
+        self, width: int = 640, what: Literal["frame", "direct", "global"] = "frame"
+    ) -> Ask[Picture]:
+        """The latest frame, small (uint8, RGB)."""
+        return Ask(m.GetPreview(width=width, what=what), picture_of("preview"))
+
+    @command
+    def show(self, pattern: AnyPattern, lease_s: float = 600.0) -> Ask[str]:
+        """Show a pattern by hand; the projector goes dark after `lease_s`."""
+        return Ask(m.Show(pattern=pattern, lease_s=lease_s), message_of)
+
+    @command
+    def snap(self, *, png: bool = False, demosaic: bool = True) -> Ask[Picture]:
+        """Take one frame as things are: native depth, or the bytes of a PNG file."""
+        return Ask(m.Snap(png=png, demosaic=demosaic), picture_of("frame", "png"), SLOW_S)
+
+    @command
+    def camera(
+        self,
+        *,
+        exposure_us: float | None = None,
+        gain: float | None = None,
+        pixel_format: str | None = None,
+        frame_rate_hz: float | None = None,
+        roi: tuple[int, int, int, int] | None = None,
+    ) -> Ask[CameraSettings]:
+        """Change the camera's settings, or with none only read them: those in force."""
+        settings = CameraSettings(
+            exposure_us=exposure_us,
+            gain=gain,
+            pixel_format=pixel_format,
+            frame_rate_hz=frame_rate_hz,
+            roi=roi,
+        )
+        return Ask(m.SetCamera(settings=settings), lambda a: expect(a.reply, m.Camera).settings)
+
+    @command
+    def light(self, name: str, on: bool) -> Ask[str]:
+        """Switch a light."""
+        return Ask(m.SetLight(name=name, on=on), message_of)
+
+    @command
+    def stage(self) -> Ask[m.StageStatus]:
+        """Where the stage is and what it is doing."""
+        return Ask(m.GetStage(), stage_of)
+
+    @command
+    def stage_home(self, timeout_s: float = 60.0) -> Ask[m.StageStatus]:
+        """Begin to find the stage's origin; `stage` and the topic stage show the end."""
+        return Ask(m.StageHome(timeout_s=timeout_s), stage_of)
+
+    @command
+    def stage_move(self, x_mm: float, y_mm: float, feed_mm_s: float) -> Ask[m.StageStatus]:
+        """Begin to go straight to a point."""
+        return Ask(m.StageMove(x_mm=x_mm, y_mm=y_mm, feed_mm_s=feed_mm_s), stage_of, SLOW_S)
+
+    @command
+    def stage_circle(
+        self,
+        centre_mm: tuple[float, float],
+        radius_mm: float,
+        feed_mm_s: float,
+        turns: float | None = None,
+    ) -> Ask[m.StageStatus]:
+        """Begin to go round a circle; without `turns` until `stage_stop`."""
+        asked = m.StageCircle(
+            centre_mm=centre_mm, radius_mm=radius_mm, feed_mm_s=feed_mm_s, turns=turns
+        )
+        return Ask(asked, stage_of, SLOW_S)
+
+    @command
+    def stage_stop(self) -> Ask[m.StageStatus]:
+        """End every motion of the stage, whoever asked for it."""
+        return Ask(m.StageStop(), stage_of, SLOW_S)
+
+    @command
+    def stage_unlock(self) -> Ask[m.StageStatus]:
+        """Leave the stage's alarm without homing."""
+        return Ask(m.StageUnlock(), stage_of, SLOW_S)
+
+    @command
+    def dark(self) -> Ask[str]:
+        """End manual work: projector dark, lights off, stage held."""
+        return Ask(m.Dark(), message_of)
+
+    @command
+    def lock(self, owner: str, note: str = "", lease_s: float = 10.0) -> Ask[m.Locked]:
+        """Take the lock, without its heartbeat: `hold` is the way to have both."""
+        return Ask(
+            m.Lock(owner=owner, note=note, lease_s=lease_s), lambda a: expect(a.reply, m.Locked)
+        )
+
+    @command
+    def renew_lock(self) -> Ask[m.Locked]:
+        """The heartbeat of this client's lock."""
+        return Ask(m.RenewLock(), lambda a: expect(a.reply, m.Locked))
+
+    @command
+    def unlock(self, *, force: bool = False) -> Ask[str]:
+        """Give the rig back; `force` breaks another's lock."""
+        return Ask(m.Unlock(force=force), message_of)

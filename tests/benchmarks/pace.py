@@ -1,0 +1,104 @@
+"""The pace of a stepped scan, against what refresh and camera allow, and against fixed sleeps.
+
+With a refresh of T seconds and an exposure of E that begins l after its trigger, a pattern cannot
+take less than T * ceil((l + E) / T): the next one is flipped at the first refresh after the
+exposure, and the readout goes on meanwhile. Two exposures: one refresh, which most projectors
+need, so that a pattern takes two; and one that leaves the host 4.6 ms to have the next pattern up
+at the very next refresh. Each scan is done twice, and the second one measured: the first renders
+each pattern for the first time, which is the simulation's own work.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from daemon.frames import FrameRecord, FrameStore
+from drivers import registry
+from drivers.base import Acquisition, Camera, CameraSettings, Context, Projector
+from protocol.scans import Checkerboard
+from tests.benchmarks.bench import daemon
+from tests.benchmarks.ratio import Ratio
+
+REFRESH_HZ = 60.0
+LATENCY_S = 50e-6
+EXPOSURES_S = {"one refresh": 1 / 60, "12 ms": 12e-3}
+NAIVE_SLEEP_S = 0.25
+NAIVE_PATTERNS = 8
+CAMERA = {"width": 320, "height": 240, "readout_ms": 2.0, "trigger_latency_us": LATENCY_S * 1e6}
+DEVICES = (
+    f'[projector]\ndriver = "virtual"\nrefresh_hz = {REFRESH_HZ}\n[camera]\ndriver = "virtual"\n'
+    + "".join(f"{key} = {value}\n" for key, value in CAMERA.items())
+)
+
+
+def scan(exposure_s: float, average: int = 1) -> Checkerboard:
+    """16 patterns, few enough for the simulation to remember them all."""
+    return Checkerboard(checker=8, shift=4, shifts=4, average=average, exposure_us=exposure_s * 1e6)
+
+
+def run() -> list[Ratio]:
+    """Ideal over real seconds a pattern, and the loop that sleeps over Umbra's."""
+    ratios = []
+    with daemon(DEVICES) as rig:
+        for name, exposure_s in EXPOSURES_S.items():
+            ideal_s = math.ceil((LATENCY_S + exposure_s) * REFRESH_HZ) / REFRESH_HZ
+            rig.client.scan(scan(exposure_s)).wait(120)
+            second = rig.client.scan(scan(exposure_s)).wait(120)
+            records = FrameStore.open(rig.data / "runs" / second.id, readonly=True).records()
+            taken_s = _seconds_a_frame(records)
+            ratios.append(
+                Ratio(
+                    name=f"scan pace, exposure of {name}",
+                    value=ideal_s / taken_s,
+                    of="what refresh and exposure allow over what the scan took, a pattern",
+                    at_least=0.9,
+                    facts={"ideal_ms": ideal_s * 1e3, "umbra_ms": taken_s * 1e3},
+                )
+            )
+    exposure_s = next(iter(EXPOSURES_S.values()))
+    naive_s, umbra_ms = _naive(exposure_s), ratios[0].facts["umbra_ms"]
+    against = Ratio(
+        name="scan pace against fixed sleeps",
+        value=naive_s * 1e3 / umbra_ms,
+        of=f"a loop that sleeps {NAIVE_SLEEP_S * 1e3:g} ms a pattern over the scan, a pattern",
+        facts={"naive_ms": naive_s * 1e3, "umbra_ms": umbra_ms},
+    )
+    return [*ratios, against]
+
+
+def _seconds_a_frame(records: Sequence[FrameRecord]) -> float:
+    starts = [record.start_ns for record in records]
+    return (starts[-1] - starts[0]) / (len(starts) - 1) / 1e9
+
+
+def _naive(exposure_s: float) -> float:
+    """Seconds a pattern of the loop that one writes first, on the same devices."""
+    context = Context()
+    projector = registry.build(
+        "projector", "virtual", "projector", {"refresh_hz": REFRESH_HZ}, context
+    )
+    camera = registry.build("camera", "virtual", "camera", dict(CAMERA), context)
+    assert isinstance(projector, Projector)
+    assert isinstance(camera, Camera)
+    projector.connect()
+    camera.connect()
+    camera.configure(CameraSettings(exposure_us=exposure_s * 1e6))
+    info = camera.info()
+    out = np.zeros(info.shape, info.pixel_format.dtype)
+    image = np.full((projector.info().height, projector.info().width), 255, np.uint8)
+    camera.start(Acquisition.SOFTWARE)
+    taken = []
+    for _ in range(NAIVE_PATTERNS + 1):
+        began = time.perf_counter()
+        projector.show(image)
+        time.sleep(NAIVE_SLEEP_S)
+        camera.trigger()
+        camera.grab(out, 5.0)
+        taken.append(time.perf_counter() - began)
+    camera.close()
+    projector.close()
+    return sum(taken[1:]) / NAIVE_PATTERNS

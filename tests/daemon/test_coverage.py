@@ -1,0 +1,164 @@
+"""What a sweep tells of the pixels that the shadow never reached."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.separation.coverage import Occluder
+from daemon.separation.estimator import Components, NotYet, Observation, Quality
+from daemon.separation.radiometry import Response
+
+HEIGHT, WIDTH = 96, 160
+DEEP = Response(full_scale=65535)
+CAST = np.s_[32:64, 56:88]  # the scene's own shadow: no direct light
+DARK = np.s_[72:88, 16:32]  # a dark marker
+
+
+def scene() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Direct and global light of a wall with a cast shadow and a dark marker."""
+    rng = np.random.default_rng(7)
+    texture = 1.0 + 0.03 * rng.standard_normal((HEIGHT, WIDTH))
+    direct, indirect = 20000.0 * texture, 12000.0 * texture
+    direct[CAST] = 0.0
+    direct[DARK] *= 0.05
+    indirect[DARK] *= 0.05
+    return direct, indirect
+
+
+def sweep(positions: Iterable[float], noise: float = 150.0, stick: int = 8) -> list[NDArray[Any]]:
+    """Frames of a vertical stick's shadow with its left edge at each position."""
+    rng = np.random.default_rng(8)
+    direct, indirect = scene()
+    columns = np.arange(WIDTH)
+    frames = []
+    for left in positions:
+        light = np.where((columns >= left) & (columns < left + stick), 0.0, 1.0) * direct + indirect
+        noisy = np.clip(light + rng.normal(0, noise, light.shape), 0, 65535)
+        frames.append(np.rint(noisy).astype(np.uint16))
+    return frames
+
+
+def separate(frames: list[NDArray[Any]], response: Response = DEEP) -> Components:
+    estimator = Occluder(response, lit_fraction=1.0)
+    for index, frame in enumerate(frames):
+        estimator.update(frame, Observation(pattern=index))
+    return estimator.result()
+
+
+WHOLE = [*range(-10, WIDTH, 2)]
+
+
+def flagged(found: Components, flag: Quality) -> NDArray[np.bool_]:
+    return np.asarray((found.quality & np.uint16(flag)) != 0)
+
+
+def test_a_whole_sweep_separates_and_flags_nothing_as_never_unlit() -> None:
+    direct, indirect = scene()
+    found = separate(sweep(WHOLE))
+    assert not flagged(found, Quality.NEVER_UNLIT).any()
+    assert not np.isnan(found.direct).any()
+    np.testing.assert_allclose(found.direct, direct, atol=1400)
+    np.testing.assert_allclose(found.global_, indirect, atol=800)
+
+
+def test_the_scenes_own_shadow_has_no_direct_light_and_says_so() -> None:
+    found = separate(sweep(WHOLE))
+    inside = np.s_[34:62, 58:86]
+    assert flagged(found, Quality.LOW_MODULATION)[inside].mean() > 0.5
+    assert np.abs(found.direct[inside]).max() < 1400
+
+
+def test_what_the_stick_never_reached_is_not_called_direct_zero() -> None:
+    """The sweep ends at column 100: beyond it nothing is known, the marker apart."""
+    found = separate(sweep(range(-10, 92, 2)))
+    beyond = flagged(found, Quality.NEVER_UNLIT)[:, 108:]
+    assert beyond.mean() > 0.99
+    assert np.isnan(found.direct[:, 108:]).mean() > 0.99
+    assert np.isnan(found.global_[:, 108:]).mean() > 0.99
+    assert flagged(found, Quality.NEVER_UNLIT)[:, :92].mean() < 0.005
+    assert (found.planes["coverage"][:, 108:][beyond] == 0).all()
+
+
+def test_a_gap_that_a_fast_hand_left_is_found_where_the_scene_is_lit() -> None:
+    """Nothing between columns 104 and 136 was shaded."""
+    positions = [p for p in WHOLE if not 96 < p < 136]
+    found = separate(sweep(positions))
+    assert flagged(found, Quality.NEVER_UNLIT)[:, 112:128].mean() > 0.99
+    outside = np.r_[0:96, 144:WIDTH]
+    assert flagged(found, Quality.NEVER_UNLIT)[:, outside].mean() < 0.005
+
+
+def test_a_dark_surface_is_not_never_unlit_for_being_dark() -> None:
+    found = separate(sweep(WHOLE, noise=700.0))
+    assert not flagged(found, Quality.NEVER_UNLIT)[DARK].any()
+    assert flagged(found, Quality.LOW_MODULATION)[DARK].mean() > 0.5
+
+
+def test_one_frame_in_the_umbra_is_kept_and_flagged() -> None:
+    found = separate(sweep(range(-10, WIDTH, 8)))  # each column shaded in one frame, 8 px steps
+    lit = np.ones((HEIGHT, WIDTH), dtype=np.bool_)
+    lit[CAST] = lit[DARK] = False
+    assert flagged(found, Quality.SINGLE)[lit].mean() > 0.99
+    assert not np.isnan(found.direct[lit]).any()
+    assert (found.planes["coverage"][lit] == 1).mean() > 0.99
+    several = separate(sweep(WHOLE))
+    assert flagged(several, Quality.SINGLE)[lit].mean() < 0.01
+    assert (several.planes["coverage"][lit] == 4).mean() > 0.95
+
+
+def test_frames_without_a_shadow_do_no_harm() -> None:
+    frames = sweep([*[WIDTH + 1] * 20, *WHOLE, *[WIDTH + 1] * 20])
+    found = separate(frames)
+    np.testing.assert_allclose(found.direct, scene()[0], atol=1500)
+    assert not flagged(found, Quality.NEVER_UNLIT).any()
+
+
+def test_no_shadow_at_all_is_no_result_but_flags() -> None:
+    found = separate(sweep([WIDTH + 1] * 12))
+    assert flagged(found, Quality.NEVER_UNLIT).all()
+    assert np.isnan(found.direct).all()
+
+
+def test_colour_and_mosaic_agree_on_coverage() -> None:
+    frames = sweep(range(-10, 92, 2))
+    colour = separate([np.repeat(f[..., None], 3, axis=2) for f in frames])
+    raw = separate(frames, Response(full_scale=65535, bayer="GR"))
+    plain = separate(frames)
+    for found in (colour, raw):
+        assert found.direct.shape == (HEIGHT, WIDTH, 3)
+        same = flagged(found, Quality.NEVER_UNLIT) == flagged(plain, Quality.NEVER_UNLIT)
+        assert same.mean() > 0.99
+    assert np.isnan(raw.direct[:, 110:]).all(axis=2).mean() > 0.99
+
+
+def test_a_resumed_sweep_gives_the_same_bits() -> None:
+    frames = sweep(WHOLE)
+    one, other = (Occluder(DEEP, lit_fraction=1.0) for _ in range(2))
+    for index, frame in enumerate(frames):
+        one.update(frame, Observation(pattern=index))
+        if index == 30:
+            one.result()
+    for index, frame in enumerate(frames):
+        other.update(frame.copy(), Observation(pattern=index))
+    a, b = one.result(), other.result()
+    assert a.direct.tobytes() == b.direct.tobytes()
+    assert a.quality.tobytes() == b.quality.tobytes()
+    assert a.planes["coverage"].tobytes() == b.planes["coverage"].tobytes()
+
+
+def test_the_summary_knows_how_far_the_sweep_is() -> None:
+    estimator = Occluder(DEEP, lit_fraction=1.0)
+    with pytest.raises(NotYet):
+        estimator.result()
+    covered = []
+    for index, frame in enumerate(sweep(WHOLE)):
+        estimator.update(frame, Observation(pattern=index))
+        covered.append(estimator.summary()["covered"])
+    assert covered[0] == 0.0
+    assert 0.3 < covered[len(covered) // 2] < 0.7
+    assert covered[-1] > 0.9

@@ -1,0 +1,127 @@
+"""Real daemons, on the virtual rig, in folders of their own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import umbra
+from protocol.errors import UmbraError
+from protocol.messages import RunState
+
+READY_S = 30.0
+
+FAST_RIG = """
+[rig]
+name = "bench"
+data = "{data}"
+time_scale = {scale}
+[network]
+command = "ipc://{folder}/c"
+events = "ipc://{folder}/e"
+[storage]
+reserve_mb = 1
+[projector]
+driver = "virtual"
+width = 128
+height = 96
+{projector}
+[camera]
+driver = "virtual"
+width = 160
+height = 120
+{camera}
+{more}
+"""
+
+
+class Daemon:
+    """One `umbrad` process after the other, with one configuration and one data folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.data = folder / "data"
+        self.endpoint = f"ipc://{folder}/c"
+        self.config = folder / "rig.toml"
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def configure(
+        self, *, camera: str = "", projector: str = "", more: str = "", scale: float = 4
+    ) -> None:
+        self.config.write_text(
+            FAST_RIG.format(
+                data=self.data,
+                folder=self.folder,
+                camera=camera,
+                projector=projector,
+                more=more,
+                scale=scale,
+            )
+        )
+
+    def start(self, *options: str) -> umbra.Client:
+        """Start it, and come back with a client when it answers."""
+        self.launch(*options)
+        return self.connect()
+
+    def launch(self, *options: str, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[bytes]:
+        environment = {k: v for k, v in os.environ.items() if k != "NOTIFY_SOCKET"}
+        with (self.folder / "log").open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "daemon.app", "--config", str(self.config), *options],
+                stdin=stdin,
+                stderr=log,
+                env=environment,
+            )
+        return self.process
+
+    def connect(self, endpoint: str = "", **options: object) -> umbra.Client:
+        deadline = time.monotonic() + READY_S
+        while True:
+            assert self.process is not None
+            assert self.process.poll() is None, self.log()
+            try:
+                return umbra.connect(endpoint or self.endpoint, timeout_s=1.0, **options)  # type: ignore[arg-type]
+            except UmbraError:
+                assert time.monotonic() < deadline, self.log()
+
+    def log(self) -> str:
+        return (self.folder / "log").read_text()
+
+    def kill(self) -> None:
+        assert self.process is not None
+        self.process.kill()
+        self.process.wait(10)
+
+    def stop(self) -> int:
+        assert self.process is not None
+        self.process.terminate()
+        return self.process.wait(20)
+
+    def close(self) -> None:
+        if self.process is not None and self.process.poll() is None:
+            self.kill()
+        if self.process is not None and self.process.stdin is not None:
+            self.process.stdin.close()
+
+
+def until(true: Callable[[], bool], seconds: float = 20.0) -> None:
+    """Ask again and again until something is true; the wait is the question's own round trip."""
+    deadline = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < deadline, "it did not come true in time"
+
+
+def recorded(rig: umbra.Client, run: str, frames: int) -> None:
+    """Wait until a run has so many frames."""
+
+    def enough() -> bool:
+        progress = rig.status().progress
+        assert progress is not None or rig.run(run).refresh().state is not RunState.FAILED
+        return progress is not None and progress.recorded >= frames
+
+    until(enough)
