@@ -106,7 +106,12 @@ def test_the_newest_image_of_a_stream_is_the_result() -> None:
 
 def test_fitted_deviations_are_those_of_repeated_scans() -> None:
     """What is stated against what ten scans do, for the methods that state it."""
-    for spec in (Sinusoid(phases=6), RandomPhase(phases=5), GrayCode(average=2)):
+    for spec in (
+        Sinusoid(phases=6),
+        RandomPhase(phases=5),
+        GrayCode(average=2),
+        TwoImage(average=3),
+    ):
         scene = Scene(sigma=0.01, ambient=0.06)
         runs = [scene.scan(spec, seed=seed) for seed in range(10)]
         for name in ("direct", "global"):
