@@ -8,9 +8,9 @@ ends, so that readout and flip go on side by side:
     camera             |expose k| readout k |expose k+1|
 
 A frame counts only if its exposure lies wholly within the time in which its pattern was lit, by
-the device's own time stamps. One that does not, that is incomplete, or that did not come in time
-is exposed again, `attempts` times in all; then it is an explicit missing record. Repeating is safe
-because a frame that is not recorded has no effect.
+the device's own time stamps, and if it looks like its pattern (`daemon.proof`). One that does not,
+that is incomplete, or that did not come in time is exposed again, `attempts` times in all; then it
+is an explicit missing record. Repeating is safe because a frame that is not recorded has no effect.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from daemon.config import SequencerSection
 from daemon.control import Control
 from daemon.devicethread import Session, Stuck
 from daemon.patterns import render
+from daemon.proof import Proof
 from daemon.recorder import Exposed, Recorder
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Buffer, Ring
@@ -67,6 +68,7 @@ class _Exposure:
     sub: int
     lit_ns: int  # from when the light was the pattern's
     dark_ns: int  # until when it was; 0: it still is
+    image: NDArray[np.uint8] | None  # what the projector was given
     end_ns: int  # when the camera said that the exposure would end
     buffer: Buffer
     grab: Future[Frame]
@@ -108,6 +110,8 @@ class Sequencer:
         self._drawn: tuple[AnyPattern, NDArray[np.uint8]] | None = None
         self._lit: Expose | None = None
         self._lit_ns = 0
+        self._lit_image: NDArray[np.uint8] | None = None
+        self._looks = Proof()
 
     def run(self, step_index: int, sub: int, taken: int) -> None:
         """All steps from `step_index`/`sub` on; `taken` frames were had before.
@@ -173,8 +177,9 @@ class Sequencer:
         elif step.pattern is None:
             self._projector.call(lambda p: p.safe(), SAFE_S, self._session)
             self._lit_ns = self._clock.now_ns()
+            self._lit_image = None
         else:
-            image = self._image(step)
+            image = self._lit_image = self._image(step)
             self._lit_ns = self._projector.call(lambda p: p.show(image), SHOW_S, self._session)
 
     def _image(self, step: Expose) -> NDArray[np.uint8]:
@@ -203,7 +208,9 @@ class Sequencer:
         grab = self._camera.submit(
             lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, self._session
         )
-        return _Exposure(index, step, sub, self._lit_ns, 0, end_ns, buffer, grab, attempt)
+        return _Exposure(
+            index, step, sub, self._lit_ns, 0, self._lit_image, end_ns, buffer, grab, attempt
+        )
 
     def _frame_deadline(self) -> float:
         exposure_us = self._camera.device.settings().exposure_us or 0.0
@@ -257,7 +264,7 @@ class Sequencer:
         self._acquire(Acquisition.SOFTWARE)
 
     def _proof(self, exposure: _Exposure, frame: Frame) -> str:
-        """Why the frame may show more or less than its pattern, by its time stamps; "" if not."""
+        """Why the frame may show more or less than its pattern, by time stamps and looks; or ""."""
         if frame.incomplete:
             return "the frame is incomplete"
         if self._projector is None:
@@ -268,7 +275,7 @@ class Sequencer:
         if exposure.dark_ns and frame.end_ns > exposure.dark_ns:
             late = (frame.end_ns - exposure.dark_ns) / NS * 1e3
             return f"the exposure ended {late:.2f} ms after its pattern was taken down"
-        return ""
+        return self._looks.problem(frame.pixels, exposure.step, exposure.image)
 
     # ------------------------------------------------------------ video steps
 

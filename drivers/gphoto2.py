@@ -14,7 +14,6 @@ and a second, and drops what comes: a late picture is never taken for the next o
 from __future__ import annotations
 
 import contextlib
-import re
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -42,11 +41,13 @@ from drivers.base import (
     Options,
 )
 from drivers.clock import NS
+from drivers.gphoto2config import Config
 from drivers.imagefile import BadImage
 from drivers.rawfile import develop
 
 SHUTTER = ("shutterspeed", "shutterspeed2", "exptime")  # what makers call it
 ISO = ("iso", "isospeed")
+MEMORY = "Internal RAM"  # not the card, which is slower
 SLICE_MS = 50  # libgphoto2 cannot be woken: so long is it until `halt` is seen
 QUIET_S = 1.0
 FIRST_PICTURE_S = 20.0
@@ -88,7 +89,7 @@ class GphotoCamera(Camera):
         found = []
         for model, port in _attached():
             camera = _opened(model, port)
-            serial = _text(camera, "serialnumber")
+            serial = Config(camera).text("serialnumber")
             camera.exit()
             found.append(
                 {
@@ -108,8 +109,9 @@ class GphotoCamera(Camera):
         try:
             with self._errors("connect"):
                 self._camera, self._identity = self._open()
-                if self._has("capturetarget"):  # not on the card, where it can
-                    self._choose("capturetarget", "Internal RAM", "connect", needed=False)
+                target = self._config.first(("capturetarget",))
+                if target and MEMORY in self._config.choices(target):
+                    self._config.set(target, MEMORY)
                 for name, value in mine.config.items():
                     self._choose(name, value, "connect")
                 stated = CameraSettings(exposure_us=mine.exposure_us, gain=mine.iso)
@@ -151,10 +153,10 @@ class GphotoCamera(Camera):
         wanted, seen = [], []
         for model, port in _attached():
             camera = _opened(model, port)
-            serial = _text(camera, "serialnumber")
+            serial = Config(camera).text("serialnumber")
             seen.append(f"{model} {serial}")
             if self.options.serial in {"", serial}:
-                identity = Identity(model, serial, _text(camera, "deviceversion"))
+                identity = Identity(model, serial, Config(camera).text("deviceversion"))
                 wanted.append((camera, identity))
             else:
                 camera.exit()
@@ -217,10 +219,10 @@ class GphotoCamera(Camera):
 
     def _step(self, names: tuple[str, ...], value: float, phase: str) -> tuple[str, str]:
         """The setting, and its choice that is nearest to `value`."""
-        name = self._first(names)
+        name = self._config.first(names)
         if not name:
             raise self._refused(phase, f"it has no {names[0]} to set", "set its dial to manual")
-        numbers = {c: n for c in self._choices(name) if (n := number(c)) is not None}
+        numbers = self._config.numbers(name)
         if not numbers or value <= 0:
             raise self._refused(phase, f"{name} cannot be set", "set its dial to manual")
         best = min(numbers, key=lambda c: max(numbers[c] / value, value / numbers[c]))
@@ -233,49 +235,26 @@ class GphotoCamera(Camera):
             )
         return name, best
 
-    def _choose(self, name: str, value: str, phase: str, *, needed: bool = True) -> None:
-        if not self._has(name):
+    def _choose(self, name: str, value: str, phase: str) -> None:
+        if not self._config.has(name):
             raise self._refused(phase, f"it has no setting {name}", "correct or remove it")
-        widget = self._camera.get_single_config(name)
-        choices = self._choices(name)
+        choices = self._config.choices(name)
         if choices and value not in choices:
-            if not needed:
-                return
             raise self._refused(
                 phase, f"{name} cannot be {value}", f"choose of {', '.join(choices)}"
             )
-        if widget.get_value() != value:
-            widget.set_value(value)
-            self._camera.set_single_config(name, widget)
+        self._config.set(name, value)
 
-    def _has(self, name: str) -> bool:
-        try:
-            self._camera.get_single_config(name)
-        except gp.GPhoto2Error as error:
-            if error.code == gp.GP_ERROR_BAD_PARAMETERS:
-                return False
-            raise
-        return True
-
-    def _first(self, names: tuple[str, ...]) -> str:
-        return next((name for name in names if self._has(name)), "")
-
-    def _choices(self, name: str) -> list[str]:
-        widget = self._camera.get_single_config(name)
-        if widget.get_type() not in {gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU}:
-            return []
-        return [str(widget.get_choice(i)) for i in range(widget.count_choices())]
-
-    def _value(self, names: tuple[str, ...]) -> float | None:
-        name = self._first(names)
-        return number(str(self._camera.get_single_config(name).get_value())) if name else None
+    @property
+    def _config(self) -> Config:
+        return Config(self._camera)
 
     def _in_force(self) -> CameraSettings:
         info = self.info()
-        seconds = self._value(SHUTTER)
+        seconds = self._config.number(SHUTTER)
         return CameraSettings(
             exposure_us=None if seconds is None else seconds * 1e6,
-            gain=self._value(ISO),
+            gain=self._config.number(ISO),
             pixel_format=info.pixel_format,
             roi=(0, 0, info.width, info.height),
         )
@@ -285,7 +264,7 @@ class GphotoCamera(Camera):
         self._halted.clear()
         self._drain(0.0)
         self._camera.trigger_capture()
-        exposure = self._value(SHUTTER) or 0.0
+        exposure = self._config.number(SHUTTER) or 0.0
         data = self._picture(phase, exposure + FIRST_PICTURE_S)
         if self._drain(0.2):
             raise self._refused(
@@ -295,8 +274,8 @@ class GphotoCamera(Camera):
             pixels, pixel_format, black = develop(data)
         except BadImage as error:
             raise self._refused(phase, f"its picture {error.problem}", error.remedy) from error
-        name = self._first(SHUTTER)
-        times = [n for c in self._choices(name) if (n := number(c)) is not None] if name else []
+        name = self._config.first(SHUTTER)
+        times = self._config.numbers(name).values() if name else ()
         self._info = CameraInfo(
             width=pixels.shape[1],
             height=pixels.shape[0],
@@ -466,19 +445,6 @@ _REMEDIES = {
 }
 
 
-def number(text: str) -> float | None:
-    """A shutter time in seconds or an ISO speed, as cameras write them: 1/125, 0.0100s, 2", 400;
-    None for Bulb, Auto and the like."""
-    found = re.fullmatch(r"\s*([0-9.]+)(?:/([0-9.]+))?\s*(?:s|sec|\")?\s*", text)
-    if found is None:
-        return None
-    try:
-        value = float(found[1]) / float(found[2] or 1)
-    except (ValueError, ZeroDivisionError):
-        return None
-    return value if value > 0 else None
-
-
 # ---------------------------------------------------------------- libgphoto2
 
 
@@ -498,15 +464,6 @@ def _opened(model: str, port: str) -> Any:
     camera.set_abilities(kinds[kinds.lookup_model(model)])
     camera.init()
     return camera
-
-
-def _text(camera: Any, name: str) -> str:
-    try:
-        return str(camera.get_single_config(name).get_value())
-    except gp.GPhoto2Error as error:
-        if error.code == gp.GP_ERROR_BAD_PARAMETERS:
-            return ""
-        raise
 
 
 def _merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:

@@ -136,7 +136,8 @@ class GrblStage(Stage):
         link.rx_bytes = min(self._build.rx_bytes, 256) - 1
         link.scale = grbl.MM_PER_INCH if self._settings.get(13) else 1.0
         wanted = self.options.identity
-        if wanted and not any(wanted in line for line in said):
+        # Grbl keeps its label in capitals, whatever was sent
+        if wanted and not any(wanted.lower() in text.lower() for text in said):
             raise DeviceRefused(
                 self.name,
                 "connect",

@@ -40,7 +40,8 @@ try:
 except UnknownDriver as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
-from drivers.gphoto2 import GphotoCamera, GphotoOptions, number  # noqa: E402
+from drivers.gphoto2 import GphotoCamera, GphotoOptions  # noqa: E402
+from drivers.gphoto2config import number  # noqa: E402
 from drivers.rawfile import develop  # noqa: E402
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import socket
@@ -13,6 +14,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import serial
+from serial import rfc2217
 from serial.tools import list_ports
 
 from drivers.base import DeviceError, DeviceLost, DeviceRefused
@@ -191,6 +194,57 @@ def test_a_networked_port() -> None:
         port.open()
     with pytest.raises(DeviceError, match="nonsense"):
         SerialPort("stage", "nonsense://x", 115200).open()
+
+
+class Rfc2217Server:
+    """A serial device server in front of a port whose ends are joined (a pty has no DTR to set)."""
+
+    def __init__(self) -> None:
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"rfc2217://127.0.0.1:{self._server.getsockname()[1]}"
+        self._device = serial.serial_for_url("loop://", timeout=0.02)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def write(self, data: bytes) -> None:
+        """As PortManager wants its connection to be."""
+        self._client.sendall(data)
+
+    def _run(self) -> None:
+        self._client, _ = self._server.accept()
+        self._client.settimeout(0.02)
+        manager = rfc2217.PortManager(self._device, self)
+        while not self._stop.is_set():
+            with contextlib.suppress(TimeoutError):
+                self._device.write(b"".join(manager.filter(self._client.recv(1024))))
+            self.write(b"".join(manager.escape(self._device.read(64))))
+        self._client.close()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._device.close()
+        self._server.close()
+
+
+@pytest.mark.filterwarnings(r"ignore:set(Daemon|Name)\(\) is deprecated")  # pyserial's own
+def test_a_networked_port_that_passes_the_baud_rate_on() -> None:
+    server = Rfc2217Server()
+    port = SerialPort("stage", server.url, 57600)
+    port.open()
+    assert server._device.baudrate == 57600
+    port.write(b"<Idle>\xff\n")
+    assert read_exactly(port, 8) == b"<Idle>\xff\n"
+    server.close()
+    with pytest.raises(DeviceLost):
+        while_open(port)
+    port.close()
+
+
+def while_open(port: SerialPort) -> None:
+    while True:
+        port.read()
 
 
 def test_lines_carry_the_time_of_their_first_byte(ptys: list[Pty]) -> None:
