@@ -5,6 +5,11 @@ from protocol.client import Client, connect
 from protocol.errors import Code, UmbraError
 from protocol.patterns import BLACK, WHITE, Checker, Solid
 from protocol.scans import (
+    CalibrateDark,
+    CalibrateLatency,
+    CalibrateLeak,
+    CalibrateNoise,
+    CalibrateTone,
     Checkerboard,
     GrayCode,
     Radiometry,
@@ -21,6 +26,11 @@ __all__ = [
     "BLACK",
     "WHITE",
     "AsyncClient",
+    "CalibrateDark",
+    "CalibrateLatency",
+    "CalibrateLeak",
+    "CalibrateNoise",
+    "CalibrateTone",
     "Checker",
     "Checkerboard",
     "Client",
@@ -37,4 +47,4 @@ __all__ = [
     "TwoImage",
     "UmbraError",
     "connect",
-]  # fmt: skip
+]

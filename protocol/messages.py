@@ -305,6 +305,7 @@ class GetResult(Command, frozen=True, kw_only=True, tag="result"):
     """Direct and global as float32 arrays, at any time from the first frames on.
 
     Arrays: `direct`, `global` (H x W or H x W x 3, RGB, linear counts), `quality` (uint16 bits).
+    A run that measures (a calibration, a verification) is answered with its facts, and no arrays.
     """
 
     run: str = ""
@@ -505,7 +506,8 @@ class Runs(Reply, frozen=True, kw_only=True, tag="runs"):
 
 
 class Result(Reply, frozen=True, kw_only=True, tag="result"):
-    """Answer to `result`; final when the run is done. `facts` is quality.json's content so far."""
+    """Answer to `result`; final when the run is done. `facts` is the content so far of
+    quality.json, or the figures of a run that measures."""
 
     run: RunInfo
     final: bool
@@ -648,6 +650,15 @@ class RigChanged(EventBody, frozen=True, kw_only=True, tag="rig-changed"):
     reason: str = ""
 
 
+class StageChanged(EventBody, frozen=True, kw_only=True, tag="stage-changed"):
+    """The stage is moved by hand: told a few times a second, and when it has come to rest."""
+
+    topic: ClassVar[str] = "stage"
+    state: StageState
+    position_mm: tuple[float, float] | None  # None while it is unknown
+    detail: str = ""  # why it stopped short
+
+
 class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
     """A small picture of the latest frame or separation. Array: `preview` (uint8, RGB)."""
 
@@ -657,7 +668,10 @@ class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
     facts: dict[str, Any] = {}
 
 
-AnyEvent = RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | PreviewTaken
+AnyEvent = (
+    RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | StageChanged
+    | PreviewTaken
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- envelopes
