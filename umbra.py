@@ -7,6 +7,7 @@ from protocol.patterns import BLACK, WHITE, Checker, Solid
 from protocol.scans import (
     Checkerboard,
     GrayCode,
+    Mesh,
     Radiometry,
     RandomBinary,
     RandomPhase,
@@ -26,6 +27,7 @@ __all__ = [
     "Client",
     "Code",
     "GrayCode",
+    "Mesh",
     "Radiometry",
     "RandomBinary",
     "RandomPhase",

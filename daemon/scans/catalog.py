@@ -6,6 +6,7 @@ from typing import Any
 
 from daemon.scans.checkerboard import CheckerboardMethod
 from daemon.scans.gray_code import GrayCodeMethod
+from daemon.scans.mesh import MeshMethod
 from daemon.scans.method import Bench, Method, Unsuitable
 from daemon.scans.random_binary import RandomBinaryMethod
 from daemon.scans.single_image import SingleImageMethod
@@ -16,6 +17,7 @@ from protocol.scans import (
     AnyScan,
     Checkerboard,
     GrayCode,
+    Mesh,
     RandomBinary,
     RandomPhase,
     SingleImage,
@@ -28,6 +30,7 @@ _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     Checkerboard: CheckerboardMethod,
     TwoImage: TwoImageMethod,
     Stick: StickMethod,
+    Mesh: MeshMethod,
     Sinusoid: SinusoidMethod,
     RandomPhase: RandomPhaseMethod,
     GrayCode: GrayCodeMethod,
