@@ -6,12 +6,23 @@ to the right and downwards.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import tau
 
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.patterns import AnyPattern, Axis, Checker, RandomPhase, Sinusoid, Solid
+from protocol.patterns import (
+    AnyPattern,
+    Axis,
+    Checker,
+    GrayCode,
+    RandomBinary,
+    RandomPhase,
+    Sinusoid,
+    Solid,
+    Stripes,
+)
 
 LEVELS = 255
 """The level of a fully lit pixel in a rendered pattern."""
@@ -26,14 +37,18 @@ def render(pattern: AnyPattern, width: int, height: int) -> NDArray[np.uint8]:
     match pattern:
         case Solid(level=level):
             return np.full((height, width), round(level * LEVELS), dtype=np.uint8)
-        case Checker():
-            columns, rows = _checker_parity(pattern, width, height)
-            lit = (rows[:, None] ^ columns[None, :]) == pattern.inverted
-            return np.where(lit, np.uint8(LEVELS), np.uint8(0))
         case Sinusoid():
             return _quantised(np.sin(sinusoid_phase(pattern, width, height)))
         case RandomPhase():
             return _quantised(np.sin(_random_phases(pattern, width, height) + pattern.phase))
+        case _:
+            lit = np.broadcast_to(_lit(pattern, width, height), (height, width))
+            return np.where(lit, np.uint8(LEVELS), np.uint8(0))
+
+
+def predistorted(image: NDArray[np.uint8], tone: Sequence[int]) -> NDArray[np.uint8]:
+    """An image of wanted light as the levels that give it; `tone`: the level for each of 256."""
+    return np.take(np.asarray(tone, dtype=np.uint8), image)
 
 
 def lit_fraction(pattern: AnyPattern, width: int, height: int) -> float:
@@ -62,12 +77,53 @@ def sinusoid_phase(pattern: Sinusoid, width: int, height: int) -> NDArray[np.flo
 
 
 def _random_phases(pattern: RandomPhase, width: int, height: int) -> NDArray[np.float64]:
-    """φ of each pixel: ½ + ½ sin φ uniform over the patches."""
+    """φ of each pixel: ½ + ½ sin φ uniform over the patches.
+
+    arcsin alone gives φ in ±π/2, where cos φ > 0: the next phase would light far more than half of
+    the source and global light would change with it. So half of the patches have π - φ.
+    """
     rows, columns = -(-height // pattern.patch), -(-width // pattern.patch)
-    level = np.random.default_rng(pattern.seed).random((rows, columns))
-    patches = np.arcsin(2.0 * level - 1.0)
+    rng = np.random.default_rng(pattern.seed)
+    patches = np.arcsin(2.0 * rng.random((rows, columns)) - 1.0)
+    patches = np.where(rng.random((rows, columns)) < 0.5, patches, np.pi - patches)
     pixels = np.repeat(np.repeat(patches, pattern.patch, axis=0), pattern.patch, axis=1)
     return np.asarray(pixels[:height, :width])
+
+
+def _lit(
+    pattern: Checker | GrayCode | Stripes | RandomBinary, width: int, height: int
+) -> NDArray[np.bool_]:
+    """Which pixels a two-valued pattern lights: (height, width), or one row or column of it."""
+    match pattern:
+        case Checker():
+            columns, rows = _checker_parity(pattern, width, height)
+            return np.asarray((rows[:, None] ^ columns[None, :]) == pattern.inverted)
+        case GrayCode():
+            along = _along(pattern.axis, width, height)
+            coded = (along ^ along >> 1) >> pattern.bit & 1 == 1
+            return np.asarray(coded != pattern.inverted)
+        case Stripes():
+            along = _along(pattern.axis, width, height)
+            return np.asarray((along - pattern.shift) // pattern.width % 2 == 0)
+        case RandomBinary():
+            return _random_patches(pattern, width, height)
+
+
+def _along(axis: Axis, width: int, height: int) -> NDArray[np.int64]:
+    """Coordinates along an axis, as a row or as a column."""
+    return np.arange(width)[None, :] if axis is Axis.X else np.arange(height)[:, None]
+
+
+def _random_patches(pattern: RandomBinary, width: int, height: int) -> NDArray[np.bool_]:
+    """Each patch has an order of its own over the images; the first ones of it are lit."""
+    if pattern.index >= pattern.count:
+        raise ValueError(f"there is no image {pattern.index} of {pattern.count}")
+    rows, columns = -(-height // pattern.patch), -(-width // pattern.patch)
+    drawn = np.random.default_rng(pattern.seed).random((rows, columns, pattern.count))
+    rank = np.count_nonzero(drawn < drawn[..., pattern.index, None], axis=2)
+    lit = rank < round(pattern.lit_fraction * pattern.count)
+    pixels = np.repeat(np.repeat(lit, pattern.patch, axis=0), pattern.patch, axis=1)
+    return pixels[:height, :width]
 
 
 def _quantised(sine: NDArray[np.float64]) -> NDArray[np.uint8]:

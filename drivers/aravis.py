@@ -1,9 +1,10 @@
 """GigE Vision and USB3 Vision cameras of any vendor through Aravis (extra `aravis`).
 
 Needs Debian's `gir1.2-aravis-0.8` beside the extra. See drivers/streaming.py for states and retry
-policy. Aravis itself repeats a register access five times in 2.5 s: one that is still unanswered
-means that the camera is gone, so it is DeviceLost and not a time-out. Letting go of a lost camera
-takes Aravis up to 8 s more, spent in `close` or in the next `connect`.
+policy. Aravis itself repeats a register access five times in 2.5 s, and others wait behind it: so
+before a call that must not hang the camera is asked for a sign of life, and one that does not
+answer within a second is DeviceLost. Letting go of a lost camera takes Aravis up to 12 s, spent in
+`close` or in the next `connect`.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ except ValueError as error:  # the bindings are there, the library is not
     raise ImportError(
         "Aravis 0.8: apt install gir1.2-aravis-0.8", name="gir1.2-aravis-0.8"
     ) from error
+
+
+ALIVE_S = 1.0  # a camera answers within milliseconds
 
 
 class AravisOptions(SfncOptions, frozen=True, kw_only=True):
@@ -95,6 +99,7 @@ class AravisCamera(SfncCamera):
         self._camera: Any = None
         self._stream: Any = None
         self._lost = threading.Event()
+        self._asking: threading.Thread | None = None
 
     @classmethod
     def discover(cls) -> list[dict[str, Any]]:
@@ -115,10 +120,9 @@ class AravisCamera(SfncCamera):
         return found
 
     def check(self) -> None:
-        """See SfncCamera; a camera that is known to be lost is not asked again."""
-        if self._lost.is_set():
-            raise self._gone("check")
-        super().check()
+        """See Camera."""
+        self._nodes("check")
+        self._still_there("check")
 
     # ------------------------------------------------------------ what a driver adds
 
@@ -211,17 +215,40 @@ class AravisCamera(SfncCamera):
 
     def _end(self) -> None:
         stream, self._stream = self._stream, None  # its last reference ends its thread
-        if stream is not None and not self._lost.is_set():
+        if stream is not None and self._answers():
             self._camera.stop_acquisition()
 
     def _release(self) -> None:
-        self._camera = self._nodes_or_none = self._stream = None
+        if self._asking is not None:
+            # What it holds must be gone before the camera is opened anew: the old connection's end
+            # would take control away from the new one.
+            self._asking.join()
+        self._asking = self._camera = self._nodes_or_none = self._stream = None
+
+    def _ready(self) -> None:
+        self._still_there("trigger")
 
     def _still_there(self, phase: str) -> None:
-        """Ask: a camera that lost its power says nothing, and its stream only stays empty."""
-        if self._lost.is_set():
+        """A camera that lost its power says nothing, and its stream only stays empty: ask it."""
+        if not self._answers():
             raise self._gone(phase)
-        self._nodes(phase).get("Width")
+
+    def _answers(self) -> bool:
+        """Whether the camera answers within a second; if not, it is lost."""
+        nodes = self._nodes("check")
+        answered = threading.Event()
+
+        def ask() -> None:
+            with contextlib.suppress(GLib.Error):  # no answer is the answer
+                nodes.get("Width")
+                answered.set()
+
+        if not self._lost.is_set():
+            self._asking = threading.Thread(target=ask, name=f"{self.name}-ask", daemon=True)
+            self._asking.start()
+            if not answered.wait(ALIVE_S):
+                self._lost.set()
+        return not self._lost.is_set()
 
     @contextlib.contextmanager
     def _errors(self, phase: str) -> Iterator[None]:

@@ -63,6 +63,7 @@ class GrblLink:
         self.strange = 0  # lines that made no sense
         self.strange_lines: deque[str] = deque(maxlen=STRANGE_KEPT)
         self.on_report: Callable[[grbl.Report], None] = lambda _report: None
+        self.on_lost: Callable[[], None] = lambda: None
         self._clock = clock
         self._arrived = threading.Event()
         self._interrupted = threading.Event()
@@ -314,6 +315,7 @@ class GrblLink:
         while (item := reader.take()) is not None:
             self._digest(*item)
         if reader.error is not None:
+            self.on_lost()
             raise DeviceLost(
                 self.port.device, "read", reader.error.problem, "check cable and power; then home"
             ) from reader.error

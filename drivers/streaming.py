@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +75,7 @@ class Buffer:
 class StreamingCamera(Camera):
     """See the module. A driver implements the methods below `what a driver adds`."""
 
-    options_type = StreamingOptions
+    options_type: ClassVar[type[Options]] = StreamingOptions
     options: StreamingOptions
 
     def __init__(self, name: str, options: StreamingOptions, context: Context) -> None:

@@ -40,14 +40,14 @@ from drivers.base import (
     StageStatus,
 )
 from drivers.clock import NS
-from drivers.serialport import SerialPort
+from drivers.serialport import SerialPort, attached
 from drivers.track import Arc, Point, Track
 
 FRAME = 9
-REPLY_S = 0.3  # a module answers within 5 ms
+REPLY_S = 0.2  # a module answers within 5 ms
 ATTEMPTS = 3
 NEAR_MM = 0.05  # a target this near to the circle is on it
-POLL_S = 0.05
+POLL_S = 0.02
 STALL_S = 1.0  # a motor that was told to turn has begun by then
 
 
@@ -85,6 +85,10 @@ STATUS = {
 }
 OK = {100, 101}
 DAMAGED = 1
+
+
+CHIPS = {(0x2A3C, None)}
+"""Trinamic's USB modules; one on RS485 shows its adapter only, and is not found."""
 
 
 class TmclOptions(Options, frozen=True, kw_only=True):
@@ -139,6 +143,11 @@ class TmclStage(Stage):
         self._at_ns = 0
         self._stands_since_ns = 0
         self._damaged = 0
+
+    @classmethod
+    def discover(cls) -> list[dict[str, Any]]:
+        """See Device; nothing is opened."""
+        return attached(CHIPS)
 
     # ------------------------------------------------------------ the line
 

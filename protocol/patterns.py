@@ -58,7 +58,7 @@ class Sinusoid(Pattern, frozen=True, kw_only=True, tag="sinusoid"):
 class RandomPhase(Pattern, frozen=True, kw_only=True, tag="random-phase"):
     """½ + ½ sin(φ + phase) with φ drawn for each patch of pixels (§4.3).
 
-    The brightness at phase 0 is uniform in 0 to 1 (the paper's), φ in ±π/2.
+    The brightness at phase 0 is uniform in 0 to 1 (the paper's), and half of the source at any.
     """
 
     patch: Length = 4
@@ -66,6 +66,36 @@ class RandomPhase(Pattern, frozen=True, kw_only=True, tag="random-phase"):
     seed: Annotated[int, Meta(ge=0)] = 1
 
 
-AnyPattern = Solid | Checker | Sinusoid | RandomPhase
+class GrayCode(Pattern, frozen=True, kw_only=True, tag="gray-code"):
+    """One bit of each pixel's coordinate in Gray code (§4.3): bit 0 has the finest stripes, 2 px
+    wide; bit j's are 2^(j+1) wide. `inverted` lights the other stripes."""
+
+    bit: Annotated[int, Meta(ge=0, le=15)] = 0
+    axis: Axis = Axis.X
+    inverted: bool = False
+
+
+class RandomBinary(Pattern, frozen=True, kw_only=True, tag="random-binary"):
+    """Image `index` of `count` in which square patches are lit at random (§3.5, 4(c)).
+
+    Each patch is lit in the same number of the images, the nearest to `lit_fraction` of them.
+    """
+
+    patch: Length = 6
+    index: Annotated[int, Meta(ge=0)] = 0
+    count: Annotated[int, Meta(ge=1, le=1000)] = 20
+    lit_fraction: Fraction = 0.5
+    seed: Annotated[int, Meta(ge=0)] = 1
+
+
+class Stripes(Pattern, frozen=True, kw_only=True, tag="stripes"):
+    """Bright and dark stripes of one width (§4.4)."""
+
+    width: Length = 2
+    axis: Axis = Axis.X
+    shift: int = 0
+
+
+AnyPattern = Solid | Checker | Sinusoid | RandomPhase | GrayCode | RandomBinary | Stripes
 BLACK = Solid(level=0.0)
 WHITE = Solid(level=1.0)

@@ -32,6 +32,7 @@ Phases = Annotated[int, Meta(ge=3, le=1000, description="phases of each period, 
 Patch = Annotated[int, Meta(ge=1, le=1024, description="side of a patch in projector pixels")]
 Seed = Annotated[int, Meta(ge=0, le=2**53, description="of the random numbers")]
 
+SUN_DEG = 0.53  # angular diameter
 AXIS = "axis along which the pattern varies: x makes vertical stripes"
 LEAKAGE = "brightness b of an unlit source element as a fraction of a lit one"
 ESTIMATOR = "how frames become components; maxmin is the paper's, auto the best for the method"
@@ -43,6 +44,14 @@ class Reference(enum.StrEnum):
     AMBIENT = "ambient"  # the source off: nothing of the source, all of the room
     BLACK = "black"  # the source showing black: ambient and leakage
     WHITE = "white"  # the source showing white: everything
+    OPEN = "open"  # no occluder before the source: everything
+
+
+class Grid(enum.StrEnum):
+    """How a mesh's holes lie."""
+
+    SQUARE = "square"
+    HEXAGONAL = "hexagonal"
 
 
 class Radiometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -57,14 +66,19 @@ class Radiometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     ) = None
 
 
-class Scan(
+class Spec(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="method"
 ):
-    """What every scan can be told, whatever its method."""
+    """What every run can be told, whatever it is for."""
 
     note: Annotated[str, Meta(description="what the run is for, kept with it")] = ""
     exposure_us: Annotated[Positive, Meta(description="exposure of a frame in µs")] | None = None
     gain: Annotated[float, Meta(description="of the camera, in its own unit")] | None = None
+
+
+class Scan(Spec, frozen=True, kw_only=True):
+    """What every scan that separates can be told."""
+
     radiometry: Radiometry = Radiometry()
     #: None: black and white where the source can show them
     references: (
@@ -100,12 +114,71 @@ class TwoImage(PatternScan, frozen=True, kw_only=True, tag="two-image"):
     checker: Checker = 8
 
 
-class Stick(Scan, frozen=True, kw_only=True, tag="stick"):
-    """A thin occluder swept over the scene on video (§4.2): α is close to 1, b = 0 in the umbra."""
+class OccluderScan(Scan, frozen=True, kw_only=True):
+    """A scan on video while an occluder moves between the scene and a source that has no pixels.
+
+    It ends at the coverage wanted or at the time limit, whichever comes first.
+    """
+
+    frames: Annotated[Count, Meta(description="frames to take at most")] | None = None
+    coverage: Annotated[
+        float,
+        Meta(gt=0.0, le=1.0, description="share of the lit pixels that ends the scan when covered"),
+    ] = 0.995
+    time_limit_s: Annotated[Positive, Meta(description="seconds after which it ends anyway")] = (
+        600.0
+    )
+    #: None: all of the rig
+    lights: Annotated[tuple[str, ...], Meta(description="sources to switch on, by name")] | None = (
+        None
+    )
+    frame_rate_hz: Annotated[Positive, Meta(description="of the camera")] | None = None
+    feed_mm_s: Annotated[Positive, Meta(description="speed of the stage")] | None = None
+
+
+class Stick(OccluderScan, frozen=True, kw_only=True, tag="stick"):
+    """A thin occluder swept over the scene on video (§4.2): α is close to 1, b = 0 in the umbra.
+
+    Swept by the rig's stage if it has one, else by hand.
+    """
 
     lit_fraction: LitFraction = 1.0
-    frames: Annotated[Count, Meta(description="frames to take")] | None = None  # None: to the end
     estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
+    axis: Annotated[Axis, Meta(description="axis of the stage along which the stick moves")] = (
+        Axis.X
+    )
+    sweeps: Annotated[int, Meta(ge=1, le=1000, description="sweeps of the stage, to and fro")] = 2
+    #: None: the stage's whole travel
+    sweep_mm: (
+        Annotated[tuple[float, float], Meta(description="from where to where on that axis, mm")]
+        | None
+    ) = None
+
+
+class Mesh(OccluderScan, frozen=True, kw_only=True, tag="mesh"):
+    """A grid of holes on a small circle, on video (§4.2): α is the hole fraction β, b = 0 in the
+    umbra. β is told, or follows from the mesh, or is measured (with an ambient and an open frame).
+    """
+
+    hole_fraction: (
+        Annotated[float, Meta(gt=0.0, lt=1.0, description="β, the part of the mesh that is hole")]
+        | None
+    ) = None
+    hole_mm: Annotated[Positive, Meta(description="diameter of a hole")] | None = None
+    pitch_mm: Annotated[Positive, Meta(description="from hole to hole")] | None = None
+    grid: Annotated[Grid, Meta(description="how the holes lie")] = Grid.SQUARE
+    radius_mm: Annotated[Positive, Meta(description="of the circle")] | None = None  # None: best
+    centre_mm: (
+        Annotated[tuple[float, float], Meta(description="of the circle on the stage")] | None
+    ) = None  # None: the middle of the travel
+    scene_mm: (
+        Annotated[float, Meta(ge=0.0, description="from the mesh to the scene, for the penumbra")]
+        | None
+    ) = None
+    source_deg: Annotated[
+        float, Meta(ge=0.0, lt=90.0, description="angular diameter of the source; sun 0.53")
+    ] = SUN_DEG
+    estimator: Annotated[Literal["auto", "maxmin"], Meta(description=ESTIMATOR)] = "auto"
 
 
 class Sinusoid(PatternScan, frozen=True, kw_only=True, tag="sinusoid"):
@@ -134,4 +207,105 @@ class RandomPhase(PatternScan, frozen=True, kw_only=True, tag="random-phase"):
     seed: Seed = 1
 
 
-AnyScan = Checkerboard | TwoImage | Stick | Sinusoid | RandomPhase
+class GrayCode(PatternScan, frozen=True, kw_only=True, tag="gray-code"):
+    """Gray code and its inverses (§4.3): direct and global from the finest stripes that each pixel
+    resolves, and the projector coordinate of each pixel. The coarsest bit comes first."""
+
+    axes: Annotated[
+        tuple[Axis, ...], Meta(min_length=1, max_length=2, description="coded axes: x, y or x,y")
+    ] = (Axis.X,)
+    bits: (
+        Annotated[int, Meta(ge=1, le=16, description="bits an axis (a recording's must be told)")]
+        | None
+    ) = None  # None: as many as the projector's size takes
+
+
+class RandomBinary(PatternScan, frozen=True, kw_only=True, tag="random-binary"):
+    """Random binary patterns in which each patch is lit equally often (§3.5)."""
+
+    patch: Patch = 6
+    patterns: Annotated[int, Meta(ge=2, le=1000, description="images")] = 20
+    seed: Seed = 1
+
+
+class SingleImage(PatternScan, frozen=True, kw_only=True, tag="single-image"):
+    """One image under fine stripes (§4.4): the peaks and valleys in a window across the stripes are
+    interpolated, and averaged over squares: components at 1/reduce of the camera's resolution."""
+
+    stripe: Annotated[int, Meta(ge=1, le=1024, description="width of a stripe, px")] = 2
+    axis: Annotated[Axis, Meta(description=AXIS)] = Axis.X
+    window: Annotated[int, Meta(ge=3, le=1001, description="n, camera px across stripes")] = 11
+    along: Annotated[int, Meta(ge=1, le=1001, description="m, camera px along stripes")] = 1
+    reduce: Annotated[int, Meta(ge=1, le=64, description="k, camera px averaged each way")] = 4
+    repeat: Annotated[Count, Meta(description="images, one after the other; live: many")] = 1
+
+
+class Measuring(Spec, frozen=True, kw_only=True):
+    """A run that measures the rig, or how well it separates: it ends in figures and plots."""
+
+
+class Calibration(Measuring, frozen=True, kw_only=True):
+    """A measurement that later runs apply by themselves, for as long as it is valid."""
+
+    @property
+    def kind(self) -> str:
+        """What it calibrates: dark, noise, leak, tone or latency."""
+        return str(self.__struct_config__.tag).removeprefix("calibrate-")
+
+
+Levels = Annotated[int, Meta(ge=3, le=256)]
+
+
+class CalibrateDark(Calibration, frozen=True, kw_only=True, tag="calibrate-dark"):
+    """Black level, read noise and hot pixels of the camera; put its lens cap on if it has one."""
+
+    exposures: Annotated[int, Meta(ge=2, le=32, description="exposure times, doubled from one to "
+                                   "the next up to the present one")] = 4  # fmt: skip
+    frames: Annotated[int, Meta(ge=2, le=1000, description="frames at each exposure")] = 8
+
+
+class CalibrateNoise(Calibration, frozen=True, kw_only=True, tag="calibrate-noise"):
+    """The camera's gain and noise by photon transfer: pairs of frames at several exposures."""
+
+    exposures: Annotated[int, Meta(ge=2, le=32, description="exposure times, evenly spread up to "
+                                   "the present one")] = 6  # fmt: skip
+    pairs: Annotated[int, Meta(ge=1, le=500, description="pairs of frames at each exposure")] = 4
+
+
+class CalibrateLeak(Calibration, frozen=True, kw_only=True, tag="calibrate-leak"):
+    """The projector's leakage b, and what lit and unlit patches of several sizes keep of it."""
+
+    sizes: Annotated[
+        tuple[Annotated[int, Meta(ge=1, le=256)], ...],
+        Meta(min_length=2, description="sides of the patches, projector px; largest: reference"),
+    ] = (1, 2, 3, 4, 6, 8, 12, 16)
+    average: Annotated[int, Meta(ge=2, le=1000, description="frames averaged a pattern")] = 2
+
+
+class CalibrateTone(Calibration, frozen=True, kw_only=True, tag="calibrate-tone"):
+    """The projector's response to its levels; patterns are then drawn so that light is linear."""
+
+    levels: Annotated[Levels, Meta(description="levels, evenly spread from black to white")] = 33
+    average: Annotated[Count, Meta(description="frames averaged a level")] = 2
+
+
+class CalibrateLatency(Calibration, frozen=True, kw_only=True, tag="calibrate-latency"):
+    """How much later than the driver says the projector's light changes, and its spread."""
+
+    longest_ms: Annotated[Positive, Meta(le=2000, description="delays up to this are found")] = 100
+    flashes: Annotated[int, Meta(ge=8, le=1000, description="flashes, their triggers spread")] = 48
+
+
+AnySeparation = (
+    Checkerboard
+    | TwoImage
+    | Stick
+    | Mesh
+    | Sinusoid
+    | RandomPhase
+    | GrayCode
+    | RandomBinary
+    | SingleImage
+)
+AnyCalibration = CalibrateDark | CalibrateNoise | CalibrateLeak | CalibrateTone | CalibrateLatency
+AnyScan = AnySeparation | AnyCalibration

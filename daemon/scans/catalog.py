@@ -4,19 +4,53 @@ from __future__ import annotations
 
 from typing import Any
 
+from daemon.scans.calibrate_dark import DarkMethod
+from daemon.scans.calibrate_latency import LatencyMethod
+from daemon.scans.calibrate_leak import LeakMethod
+from daemon.scans.calibrate_noise import NoiseMethod
+from daemon.scans.calibrate_tone import ToneMethod
 from daemon.scans.checkerboard import CheckerboardMethod
+from daemon.scans.gray_code import GrayCodeMethod
+from daemon.scans.mesh import MeshMethod
 from daemon.scans.method import Bench, Method, Unsuitable
+from daemon.scans.random_binary import RandomBinaryMethod
+from daemon.scans.single_image import SingleImageMethod
 from daemon.scans.sinusoid import RandomPhaseMethod, SinusoidMethod
 from daemon.scans.stick import StickMethod
 from daemon.scans.two_image import TwoImageMethod
-from protocol.scans import AnyScan, Checkerboard, RandomPhase, Sinusoid, Stick, TwoImage
+from protocol.scans import (
+    AnyScan,
+    CalibrateDark,
+    CalibrateLatency,
+    CalibrateLeak,
+    CalibrateNoise,
+    CalibrateTone,
+    Checkerboard,
+    GrayCode,
+    Mesh,
+    RandomBinary,
+    RandomPhase,
+    SingleImage,
+    Sinusoid,
+    Stick,
+    TwoImage,
+)
 
 _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     Checkerboard: CheckerboardMethod,
     TwoImage: TwoImageMethod,
     Stick: StickMethod,
+    Mesh: MeshMethod,
     Sinusoid: SinusoidMethod,
     RandomPhase: RandomPhaseMethod,
+    GrayCode: GrayCodeMethod,
+    RandomBinary: RandomBinaryMethod,
+    SingleImage: SingleImageMethod,
+    CalibrateDark: DarkMethod,
+    CalibrateNoise: NoiseMethod,
+    CalibrateLeak: LeakMethod,
+    CalibrateTone: ToneMethod,
+    CalibrateLatency: LatencyMethod,
 }
 
 NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())

@@ -14,9 +14,9 @@ from typing import Any, ClassVar, Generic, TypeVar
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation
 from drivers.base import CameraInfo, ProjectorInfo, StageInfo
 from protocol.patterns import AnyPattern
-from protocol.scans import Scan
+from protocol.scans import Spec
 
-S = TypeVar("S", bound=Scan)
+S = TypeVar("S", bound=Spec)
 
 
 class Unsuitable(Exception):
@@ -35,7 +35,8 @@ class Bench:
     projector: ProjectorInfo | None = None
     stage: StageInfo | None = None
     lights: tuple[str, ...] = ()
-    calibration: Mapping[str, Any] | None = None  # of this rig's devices, by name
+    exposure_us: float | None = None  # of the camera as it is set
+    calibration: Mapping[str, Any] | None = None  # values that apply: see daemon.calibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,16 +50,50 @@ class Expose:
     lighting: Lighting = Lighting.PATTERN
     index: int = 0  # which of the pattern set
     frames: int = 1
+    exposure_us: float | None = None  # None: the run's
+    delay_s: float = 0.0  # from the light being the pattern's to the first trigger
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """A motion of the stage: round and round, without an end of its own."""
+
+    centre_mm: tuple[float, float]
+    radius_mm: float
+    feed_mm_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """A motion of the stage: straight to each point in turn; it ends at the last."""
+
+    points_mm: tuple[tuple[float, float], ...]
+    feed_mm_s: float
+
+
+Motion = Circle | Sweep
 
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """A step: let the camera stream, `frames` of them or (None) to the end of a recording."""
+    """A step: let the camera stream, `frames` of them or (None) to the end of a recording, or until
+    the method says `enough`, or its motion ends.
+
+    `lights` are switched on before; the stage is homed if it must be, and moves meanwhile.
+    """
 
     frames: int | None
+    motion: Motion | None = None
+    lights: tuple[str, ...] = ()
 
 
-Step = Expose | Watch
+@dataclass(frozen=True, slots=True)
+class Digest:
+    """A step without frames: the next is asked for only when the estimator has taken in all frames
+    before it, so that it may depend on what they said."""
+
+
+Step = Expose | Watch | Digest
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +104,8 @@ class Taken:
     sub: int
     incomplete: bool
     source: str = ""
+    delay_us: float = 0.0  # see Observation
+    exposure_us: float = 0.0
 
 
 class Method(ABC, Generic[S]):
@@ -97,6 +134,11 @@ class Method(ABC, Generic[S]):
     @abstractmethod
     def estimator(self) -> Estimator:
         """A fresh estimator for this scan."""
+
+    def enough(self, summary: Mapping[str, float], seconds: float) -> str:
+        """Why a video may end now, `seconds` after it began; "": it goes on."""
+        del summary, seconds
+        return ""
 
     def conclude(self, components: Components) -> Components:
         """The last word on the components before they are kept (masks that need the whole)."""

@@ -8,6 +8,7 @@ an upper bound (`from_picture`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Any
 
 import cv2
@@ -27,6 +28,7 @@ _ENOUGH = 200  # differences that make a level's deviation
 _SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 _SECOND_DIFFERENCE_NORM = 6.0  # what it makes of independent samples of deviation 1
 _BLOCK = 16
+_BLOCKS = 12  # blocks that make a level's deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,15 @@ class Noise:
         """Standard deviation at each sample's level: float32, same shape; linear between levels."""
         return np.asarray(np.interp(counts, self.levels, self.deviations), dtype=np.float32)
 
+    def of_a_sensor(self) -> Noise:
+        """The same, with no level noisier than a linear sensor can be: its variance a + b x level
+        (read and shot noise) is bounded by that of any other level. What is beyond it is motion.
+        """
+        at, found = np.asarray(self.levels), np.asarray(self.deviations)
+        grown = np.maximum(np.sqrt(at[:, None] / at[None, :]), 1.0)
+        bounded = np.min(found[None, :] * grown, axis=1)
+        return Noise(self.levels, tuple(float(d) for d in bounded))
+
     @property
     def typical(self) -> float:
         """The median over levels, for people."""
@@ -47,14 +58,17 @@ class Noise:
 
 
 class TemporalNoise:
-    """Noise from pairs of frames in which most of the scene was the same.
+    """Noise from pairs of frames in which part of the scene was the same.
 
     Differences are counted by level and size; the median of a level's tells its noise, whatever
-    moved in less than half of the picture. Memory: one small table.
+    moved in less than half of the picture. `quantile` below .5 withstands more motion, and is
+    coarser. Memory: one small table.
     """
 
-    def __init__(self, full_scale: int) -> None:
+    def __init__(self, full_scale: int, quantile: float = 0.5) -> None:
         self._full_scale = full_scale
+        self._quantile = quantile
+        self._scale = 1.0 / NormalDist().inv_cdf(0.5 + quantile / 2.0)
         self._table = np.zeros((_LEVELS, _BINS), dtype=np.int64)
         self.pairs = 0
 
@@ -77,19 +91,19 @@ class TemporalNoise:
         for index, row in enumerate(self._table):
             if row.sum() < _ENOUGH:
                 continue
-            found = _MAD * _median_difference(row) / np.sqrt(2.0)
+            found = self._scale * _difference(row, self._quantile) / np.sqrt(2.0)
             levels.append((index + 0.5) * (self._full_scale + 1) / _LEVELS)
             deviations.append(float(max(found, _ROUNDING)))
         return Noise(tuple(levels), tuple(deviations)) if levels else None
 
 
-def _median_difference(row: NDArray[np.int64]) -> float:
-    """The median of a row of the table; differences of whole counts stand for ± half a count."""
+def _difference(row: NDArray[np.int64], quantile: float) -> float:
+    """A quantile of a row of the table; differences of whole counts stand for ± half a count."""
     edges = np.exp2(np.arange(_BINS + 1) / _PER_OCTAVE) - 1.0
     share = np.cumsum(row) / row.sum()
-    at = int(np.searchsorted(share, 0.5))
+    at = int(np.searchsorted(share, quantile))
     before = share[at - 1] if at else 0.0
-    within = (0.5 - before) / (share[at] - before)
+    within = (quantile - before) / (share[at] - before)
     # a bin holds at most one whole count where it is narrow: spread it over ± half a count
     low, high = edges[at], edges[at + 1]
     if high - low < 1.0:
@@ -105,24 +119,32 @@ def noise_range(samples: int) -> float:
 
 
 def from_picture(counts: Plane, full_scale: int, step: int = 1) -> Noise:
-    """Noise of a single picture (H, W): what a second difference leaves where the scene is smooth.
+    """Noise of a single picture (H, W) by level: what a second difference leaves where the scene is
+    smooth.
 
-    Textured blocks say too much, so that the quietest fifth of the blocks speaks: an upper bound
-    in a scene that is textured everywhere. `step` is the distance of samples of one colour (2 in a
-    mosaic). Never less than the rounding of counts.
+    Textured blocks say too much, so that at each level the quietest fifth of the blocks speaks: an
+    upper bound in a scene that is textured everywhere. `step` is the distance of samples of one
+    colour (2 in a mosaic). Never less than the rounding of counts.
     """
     plane = np.ascontiguousarray(counts[::step, ::step])
-    deviation = _ROUNDING
-    if min(plane.shape) >= _BLOCK:
-        second = np.abs(cv2.filter2D(plane, -1, _SECOND_DIFFERENCE, borderType=cv2.BORDER_REFLECT))
-        height, width = (n // _BLOCK for n in second.shape)
-        tiles = second[: height * _BLOCK, : width * _BLOCK].reshape(height, _BLOCK, width, _BLOCK)
-        spread = np.median(tiles.transpose(0, 2, 1, 3).reshape(height * width, -1), axis=1)
-        spread = spread[np.isfinite(spread)]
-        if spread.size:
-            quiet = float(np.quantile(spread, 0.2)) * _MAD / _SECOND_DIFFERENCE_NORM
-            deviation = max(quiet, _ROUNDING)
-    return Noise((0.0, float(full_scale)), (float(deviation), float(deviation)))
+    height, width = (n // _BLOCK for n in plane.shape)
+    if height * width == 0:
+        return Noise((0.0, float(full_scale)), (_ROUNDING, _ROUNDING))
+    second = np.abs(cv2.filter2D(plane, -1, _SECOND_DIFFERENCE, borderType=cv2.BORDER_REFLECT))
+
+    def by_block(values: Plane) -> Plane:
+        tiles = values[: height * _BLOCK, : width * _BLOCK]
+        tiles = tiles.reshape(height, _BLOCK, width, _BLOCK).transpose(0, 2, 1, 3)
+        return np.asarray(np.median(tiles.reshape(height * width, -1), axis=1))
+
+    spread, level = by_block(np.asarray(second, dtype=np.float32)), by_block(plane)
+    order = np.argsort(level, kind="stable")
+    levels, deviations = [], []
+    for group in np.array_split(order, min(max(order.size // _BLOCKS, 1), 8)):
+        quiet = float(np.quantile(spread[group], 0.2)) * _MAD / _SECOND_DIFFERENCE_NORM
+        levels.append(float(np.mean(level[group])))
+        deviations.append(max(quiet, _ROUNDING))
+    return Noise(tuple(levels), tuple(deviations))
 
 
 def from_frame(counts: NDArray[Any], full_scale: int, bayer: str) -> Noise:
@@ -130,4 +152,4 @@ def from_frame(counts: NDArray[Any], full_scale: int, bayer: str) -> Noise:
     if counts.ndim == 2:
         return from_picture(counts.astype(np.float32), full_scale, step=2 if bayer else 1)
     channels = (from_picture(c.astype(np.float32), full_scale) for c in np.moveaxis(counts, 2, 0))
-    return max(channels, key=lambda one: one.deviations[0])
+    return max(channels, key=lambda one: one.typical)

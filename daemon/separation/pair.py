@@ -14,6 +14,9 @@ from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
 
+_RESIDUAL = 0.02
+"""Part of the light by which a pattern and its complement may miss black and white together."""
+
 
 class ComplementPair:
     """Two images -> direct, global. Frames of pattern 0 and of its complement, pattern 1, are
@@ -28,6 +31,7 @@ class ComplementPair:
         self._references = References(response)
         self._means = (FrameMean(response), FrameMean(response))
         self._noise = ScanNoise(response, average)
+        self._average = average
         self._saturated: NDArray[np.bool_] | None = None
         self._unused = 0
 
@@ -59,6 +63,7 @@ class ComplementPair:
         ambient, source = self._ambient(first, second)
         lit, unlit = (first, second) if ambient is None else (first - ambient, second - ambient)
         brightest = np.maximum(first, second)
+        deviation = self._noise.deviation(brightest)
         direct, indirect = light_model.from_complement_pair(lit, unlit, self._alpha, self._leakage)
         return finish(
             direct,
@@ -66,7 +71,8 @@ class ComplementPair:
             response=self._response,
             brightest=brightest,
             saturated=self._saturated,
-            judgement=Judgement.of_extremes(self._noise.deviation(brightest), 2),
+            planes=self._deviations(deviation),
+            judgement=Judgement.of_extremes(deviation, 2),
             facts={
                 "estimator": "complement pair",
                 "patterns": 2,
@@ -78,6 +84,21 @@ class ComplementPair:
                 **self._residual(first, second),
             },
         )
+
+    def _deviations(self, deviation: Plane) -> dict[str, NDArray[Any]]:
+        """Standard deviations of direct and global from noise; edges of checkers, which are the
+        greater error of two images, are not noise."""
+        b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
+        h = light_model.global_weight(1.0 - self._alpha, b)
+        least = min(light_model.complement_determinants(self._alpha, b))
+        ambient = 0.0  # of its variance in one frame's, in L_g = (I_unlit - A - b(I_lit - A))/det
+        for kind in (Lighting.AMBIENT, Lighting.BLACK):
+            if not ambient and self._references.frames(kind):
+                ambient = self._average * (1.0 - b) ** 2 / self._references.frames(kind)
+        return {
+            "direct_std": deviation * np.float32(np.hypot(g, h) / least),
+            "global_std": deviation * np.float32(np.sqrt(1.0 + b * b + ambient) / least),
+        }
 
     def _ambient(self, first: Plane, second: Plane) -> tuple[Plane | None, str]:
         """Ambient light; a black frame's leakage is (L_d + L_g) b, and P + I = 2A + (1 + b) times
@@ -93,7 +114,7 @@ class ComplementPair:
         ambient: Plane = black - whole * np.float32(b / (1.0 - b))
         return ambient, "black frame and the pair"
 
-    def _residual(self, first: Plane, second: Plane) -> dict[str, float]:
+    def _residual(self, first: Plane, second: Plane) -> dict[str, Any]:
         """Median of (P + I - W - K)/(W + K): not 0 for a wrong tone curve."""
         black = self._references.mean(Lighting.BLACK)
         white = self._references.mean(Lighting.WHITE)
@@ -102,7 +123,17 @@ class ComplementPair:
         whole = white + black
         bright = whole > 0.1 * float(np.max(whole))
         residual = (first + second - whole)[bright] / whole[bright]
-        return {"complement_residual": round(float(np.median(residual)), 5)}
+        found = round(float(np.median(residual)), 5)
+        return {
+            "complement_residual": found,
+            "advice": [
+                f"the two images together have {found:+.1%} of the light of black and white "
+                "together: the camera's tone curve is not the one given, or the source changed; "
+                "give the curve with --tone"
+            ]
+            if abs(found) > _RESIDUAL
+            else [],
+        }
 
     def summary(self) -> dict[str, float]:
         """Frames of both images, and those not used."""

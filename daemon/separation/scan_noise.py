@@ -42,9 +42,14 @@ class ScanNoise:
         self._last = pattern, sample
 
     @property
+    def measured(self) -> bool:
+        """Whether it is measured, not an upper bound."""
+        return self._repeats.pairs > 0
+
+    @property
     def source(self) -> str:
         """From what the noise is known."""
-        return "repeated frames" if self._repeats.pairs else "one picture"
+        return "repeated frames" if self.measured else "one picture"
 
     def deviation(self, light: Plane) -> Plane:
         """Standard deviation of a pattern's averaged linear light at a level of it (float32)."""
@@ -80,6 +85,14 @@ class ResidualNoise:
     def measured(self) -> bool:
         """Whether it is measured, not an upper bound."""
         return self._fitted() is not None
+
+    @property
+    def misfit(self) -> float | None:
+        """What the fit leaves over what a picture shows: far above 1, frames are no sinusoid."""
+        fitted = self._fitted()
+        if fitted is None or self._picture is None:
+            return None
+        return fitted.typical / self._picture.typical
 
     def noise(self) -> Noise | None:
         """Deviation of one frame's counts by level."""

@@ -31,6 +31,11 @@ _DISAGREE_PART = 0.1
 """... and by this part of the light: a smaller difference is a bend of the projector's curve."""
 
 
+_MISFIT = 5.0
+"""So far above a picture's noise, what the fit leaves is not noise."""
+_MEAN_OFF = 0.03
+
+
 class LeastSquares:
     """Frames of N >= 3 phases of one or several sinusoids -> direct, global, φ.
 
@@ -87,7 +92,11 @@ class LeastSquares:
         if not ready or self._saturated is None:
             raise NotYet("a sinusoid needs 3 phases; they have not all come yet")
         noise = self._noise.noise()
-        solved = [self._separate(fit, noise) for fit in ready]
+        blur = self._blur(ready)
+        solved = [
+            self._separate(fit, noise, gain)
+            for fit, gain in zip(ready, self._gains(blur, len(ready)), strict=True)
+        ]
         direct, indirect, direct_var, global_var = _combine(solved)
         brightest = np.maximum.reduce([fit.brightest() for fit in ready])
         quality = np.zeros(direct.shape[:2], dtype=np.uint16)
@@ -99,17 +108,22 @@ class LeastSquares:
         }
         planes.update(self._correspondence(ready))
         ratio = self._mean_ratio(ready[0])
+        misfit = self._noise.misfit
         facts: dict[str, Any] = {
             "estimator": "lsq",
             "patterns": sum(fit.frames for fit in self._fits),
             "frequencies": len(ready),
+            "blur_px": None if blur is None else round(blur, 3),
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
             "noise_from": self._noise.source,
-            **self._references.facts(self._ambient_source()),
+            **self._references.facts(
+                self._references.total(ready[0].solve()[0], self._leakage).source
+            ),
             **ratio,
-            "advice": _advice(ratio),
+            "misfit": None if misfit is None else round(misfit, 3),
+            "advice": _advice(ratio, misfit),
         }
         return finish(
             direct,
@@ -135,7 +149,43 @@ class LeastSquares:
             "unused": float(self._unused),
         }
 
-    def _separate(self, fit: _Fit, noise: Noise | None) -> tuple[Plane, Plane, Plane, Plane]:
+    def _blur(self, ready: list[_Fit]) -> float | None:
+        """The blur of projector and camera together, in projector pixels; None from one period.
+
+        Blur of standard deviation s takes exp(-2π²s²f²) from a wave of frequency f, so the ratio of
+        two waves' amplitudes tells s. The median over the scene is taken: scattering within the
+        scene, which is global light, differs from place to place and stays in the amplitudes.
+        """
+        if len(ready) < 2 or len(ready) != len(self._periods):
+            return None
+        squares = self._squared_frequencies()
+        logs = []
+        first = None
+        for fit in ready:
+            _, cosine, sine = fit.solve()
+            power = (cosine * cosine + sine * sine)[::2, ::2]
+            first = power if first is None else first
+            bright = first > np.quantile(first, 0.5)
+            ratio = power[bright] / np.maximum(first[bright], np.float32(1e-12))
+            logs.append(0.5 * float(np.log(np.maximum(np.median(ratio), 1e-6))))
+        slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
+        return float(np.sqrt(max(-slope, 0.0) / (2.0 * np.pi**2)))
+
+    def _squared_frequencies(self) -> NDArray[np.float64]:
+        """Mean square of each wave's spatial frequency; its weave makes it higher along the other
+        axis."""
+        squares: NDArray[np.float64] = 1.0 / np.square(np.asarray(self._periods))
+        return squares * (1.0 + 0.5 * self._weave**2)
+
+    def _gains(self, blur: float | None, count: int) -> list[float]:
+        """What gives each wave its amplitude back."""
+        if not blur:
+            return [1.0] * count
+        return [float(g) for g in np.exp(2.0 * np.pi**2 * blur**2 * self._squared_frequencies())]
+
+    def _separate(
+        self, fit: _Fit, noise: Noise | None, gain: float
+    ) -> tuple[Plane, Plane, Plane, Plane]:
         """Direct, global and their variances from one frequency."""
         mean, cosine, sine = fit.solve()
         b = self._leakage
@@ -146,44 +196,13 @@ class LeastSquares:
             # |B| of noise alone is not 0: to first order its square is too large by one variance.
             power = np.maximum(power - np.float32(wave_var) * sigma * sigma, 0)
         amplitude: Plane = np.sqrt(power)
-        direct: Plane = amplitude * np.float32(2.0 / (1.0 - b))
-        total, total_weight = self._total(mean)
-        indirect: Plane = total - direct
+        direct: Plane = amplitude * np.float32(2.0 * gain / (1.0 - b))
+        total = self._references.total(mean, b)
+        indirect: Plane = total.light - direct
         variance = sigma * sigma
-        direct_var: Plane = variance * np.float32(wave_var * (2.0 / (1.0 - b)) ** 2)
-        total_var: Plane = variance * np.float32(mean_var * total_weight**2)
-        for kind, weight in self._reference_weights(total_weight):
-            at = self._references.mean(kind)
-            if at is not None:
-                one = self._response.deviation(noise, self._response.counts(at))
-                frames = self._references.frames(kind)
-                total_var += one * one * np.float32(weight**2 / frames)
+        direct_var: Plane = variance * np.float32(wave_var * (2.0 * gain / (1.0 - b)) ** 2)
+        total_var: Plane = variance * np.float32(mean_var * total.of_half + total.of_frame)
         return direct, indirect, direct_var, direct_var + total_var
-
-    def _total(self, mean: Plane) -> tuple[Plane, float]:
-        """L_d + L_g from the mean, and what a change of the mean changes in it.
-
-        With a source-off frame 2(M - A)/(1 + b); with a black frame, which holds its leakage,
-        2(M - K)/(1 - b); else 2M/(1 + b).
-        """
-        off = self._references.mean(Lighting.AMBIENT)
-        black = self._references.mean(Lighting.BLACK)
-        if off is None and black is not None:
-            weight = 2.0 / (1.0 - self._leakage)
-            return (mean - black) * np.float32(weight), weight
-        weight = 2.0 / (1.0 + self._leakage)
-        return (mean if off is None else mean - off) * np.float32(weight), weight
-
-    def _reference_weights(self, weight: float) -> list[tuple[Lighting, float]]:
-        source = self._ambient_source()
-        if source == "none":
-            return []
-        return [(Lighting.AMBIENT if source == "ambient frame" else Lighting.BLACK, weight)]
-
-    def _ambient_source(self) -> str:
-        if self._references.frames(Lighting.AMBIENT):
-            return "ambient frame"
-        return "black frame" if self._references.frames(Lighting.BLACK) else "none"
 
     def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
         mean, _, _ = fit.solve()
@@ -288,12 +307,20 @@ def _disagree(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> NDArray[np.boo
     return differ if differ.ndim == 2 else np.asarray(np.logical_or.reduce(differ, axis=2))
 
 
-def _advice(ratio: dict[str, float]) -> list[str]:
+def _advice(ratio: dict[str, float], misfit: float | None) -> list[str]:
+    """What to do about frames that are no sinusoids in time; [] where they are."""
+    lines = []
+    if misfit is not None and misfit > _MISFIT:
+        lines.append(
+            f"the frames are {misfit:.0f} times further from a sinusoid than noise takes them: "
+            "they are not the phases that were declared (--phases, --periods), the tone curve is "
+            "not linear, or something moved"
+        )
     found = ratio.get("mean_ratio")
-    if found is None or abs(found - 1.0) < 0.03:
-        return []
-    return [
-        f"the mean over the phases is {found:.2f} of half the light, not 1: the projector's or the "
-        "camera's tone curve is not linear, and global is wrong by as much: run `umbra calibrate "
-        "tone`, or give the camera's curve with --tone"
-    ]
+    if found is not None and abs(found - 1.0) >= _MEAN_OFF:
+        lines.append(
+            f"the mean over the phases is {found:.2f} of half the light, not 1: the projector's or "
+            "the camera's tone curve is not linear, and global is wrong by as much: run `umbra "
+            "calibrate tone`, or give the camera's curve with --tone"
+        )
+    return lines

@@ -21,12 +21,15 @@ from protocol.cli.watch import follow, must_be_done
 from protocol.cli.words import Fetched, frames
 from protocol.errors import Code, UmbraError
 from protocol.messages import Health, RunInfo
-from protocol.scans import AnyScan, Reference
+from protocol.scans import AnySeparation, Reference
 
 if TYPE_CHECKING:
     from protocol.client import Client
 
-LIVE = {"exposure_us", "gain", "references"}
+LIVE = {
+    *("exposure_us", "gain", "references", "lights", "frame_rate_hz", "feed_mm_s"),
+    *("coverage", "time_limit_s", "sweeps", "sweep_mm", "radius_mm", "centre_mm"),
+}
 """Fields that are no options here: the photographs have them, or the files given say them."""
 OPTIONS = union_options(METHODS, without=LIVE)
 
@@ -50,7 +53,7 @@ def _separate(
         Path, typer.Argument(metavar="DIR", help="A folder of images in natural order, or a video.")
     ],
     method: Annotated[
-        str, tag_option(AnyScan, "-m", "--method", help_text="How the scene was lit.")
+        str, tag_option(AnySeparation, "-m", "--method", help_text="How the scene was lit.")
     ],
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="OUT", help="Folder for the products.")
@@ -58,6 +61,7 @@ def _separate(
     black_frame: Annotated[Path | None, _frame("with the projector showing black")] = None,
     white_frame: Annotated[Path | None, _frame("with the projector showing white")] = None,
     ambient_frame: Annotated[Path | None, _frame("with the source off")] = None,
+    open_frame: Annotated[Path | None, _frame("with no occluder before the source (mesh)")] = None,
     bayer: Annotated[
         Bayer | None, typer.Option(help="The images are a raw colour mosaic that begins so.")
     ] = None,
@@ -79,6 +83,7 @@ def _separate(
         Reference.BLACK: black_frame,
         Reference.WHITE: white_frame,
         Reference.AMBIENT: ambient_frame,
+        Reference.OPEN: open_frame,
     }
     first = {kind: file.absolute() for kind, file in shots.items() if file is not None}
     spec = spec_of(method, given, references=list(first))

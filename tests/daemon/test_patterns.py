@@ -8,7 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daemon.patterns import lit_fraction, render
-from protocol.patterns import BLACK, WHITE, Axis, Checker, RandomPhase, Sinusoid, Solid
+from protocol.patterns import (
+    BLACK,
+    WHITE,
+    Axis,
+    Checker,
+    GrayCode,
+    RandomBinary,
+    RandomPhase,
+    Sinusoid,
+    Solid,
+    Stripes,
+)
 
 checkers = st.builds(
     Checker,
@@ -96,6 +107,34 @@ def test_the_brightness_of_random_phases_is_uniform() -> None:
     assert counts.min() > 0.9 * counts.mean()
 
 
-@pytest.mark.parametrize("pattern", [Sinusoid(), RandomPhase()])
-def test_waves_light_half_of_the_source(pattern: Sinusoid | RandomPhase) -> None:
-    assert lit_fraction(pattern, 320, 240) == pytest.approx(0.5, abs=0.01)
+@pytest.mark.parametrize("phase", [0.0, np.pi / 2, 2 * np.pi / 3])
+@pytest.mark.parametrize("kind", [Sinusoid, RandomPhase])
+def test_waves_light_half_of_the_source_at_every_phase(
+    kind: type[Sinusoid] | type[RandomPhase], phase: float
+) -> None:
+    assert lit_fraction(kind(phase=phase), 320, 240) == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("axis", list(Axis))
+def test_gray_code_neighbours_differ_in_one_bit(axis: Axis) -> None:
+    shown = [render(GrayCode(bit=bit, axis=axis), 64, 64) > 0 for bit in range(6)]
+    lines = np.stack([image[0] if axis is Axis.X else image[:, 0] for image in shown])
+    assert ((lines[:, 1:] != lines[:, :-1]).sum(axis=0) == 1).all()
+    binary = np.bitwise_xor.accumulate(lines[::-1].astype(int), axis=0)
+    np.testing.assert_array_equal(binary.T @ (1 << np.arange(6)[::-1]), np.arange(64))
+    assert (shown[2] != (render(GrayCode(bit=2, axis=axis, inverted=True), 64, 64) > 0)).all()
+
+
+def test_stripes() -> None:
+    image = render(Stripes(width=2, axis=Axis.Y, shift=1), 3, 6)
+    assert (image[:, 0] > 0).tolist() == [False, True, True, False, False, True]
+
+
+def test_random_patches_are_lit_equally_often_and_differently() -> None:
+    images = np.stack([render(RandomBinary(index=k, count=10), 60, 48) > 0 for k in range(10)])
+    assert (images.sum(axis=0) == 5).all()
+    assert len({image.tobytes() for image in images}) == 10
+    patches = images[0].reshape(8, 6, 10, 6)
+    assert (patches == patches[:, :1, :, :1]).all()
+    with pytest.raises(ValueError, match="no image 10 of 10"):
+        render(RandomBinary(index=10, count=10), 60, 48)

@@ -54,7 +54,7 @@ class Faults:
     swallow_acks: int = 0  # the next so many oks are lost on the line
     noise: list[bytes] = field(default_factory=list)  # goes out between answers
     switch_missing: bool = False  # homing finds no switch: ALARM:9
-    homing_s: float = 0.3
+    homing_s: float = 0.1
     hard_limit_at: float | None = None  # x below which a limit switch closes: ALARM:1
     refuse: dict[str, int] = field(default_factory=dict)  # part of a line -> error code
 

@@ -94,11 +94,11 @@ def moving(status: StageStatus) -> bool:
 def test_connects_to_boards_that_reset_on_opening_and_to_those_that_do_not(
     tmp_path: Path, resets: bool
 ) -> None:
-    made = Settings(label="bench")
+    made = Settings(label="BENCH-1")  # as Grbl keeps `$I=bench-1`
     with GrblPeer(tmp_path, resets_on_open=resets, boot_s=0.2, settings=made) as peer:
-        stage = make(peer)
+        stage = make(peer, identity="bench")
         identity = stage.connect()
-        assert (identity.model, identity.serial) == ("Grbl", "bench")
+        assert (identity.model, identity.serial) == ("Grbl", "BENCH-1")
         assert identity.firmware == "1.1h.20190830"
         info = stage.info()
         assert info.travel_mm == ((-40.0, 0.0), (-40.0, 0.0))
@@ -230,9 +230,9 @@ def test_halt_ends_homing(peer: GrblPeer, stage: GrblStage) -> None:
     with pytest.raises(DeviceError, match="halt"):
         stage.home(120.0)
     timer.join()
+    assert stage.status().state is not StageState.HOMING
     assert peer.state != "Home"
     peer.faults.homing_s = 0.1
-    assert stage.status().state is StageState.ALARM
     stage.home(10.0)
 
 
@@ -558,6 +558,7 @@ def test_pulled_and_back_under_another_name(peer: GrblPeer, homed: GrblStage) ->
     peer.unplug()
     with pytest.raises(DeviceLost):
         pump_until(homed, lambda s: False)
+    assert homed.position_at(homed.clock.now_ns()) is None
     homed.halt()
     with pytest.raises(DeviceLost):
         homed.connect()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import socket
@@ -11,13 +12,20 @@ import tty
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import serial
+from serial import rfc2217
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
+from drivers import serialport
 from drivers.base import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import RealClock
+from drivers.grbl import GrblStage
 from drivers.serialport import LONGEST_LINE, LineReader, SerialPort
+from drivers.tmcl import TmclStage
 
 pytestmark = pytest.mark.timeout(10)
 
@@ -193,6 +201,57 @@ def test_a_networked_port() -> None:
         SerialPort("stage", "nonsense://x", 115200).open()
 
 
+class Rfc2217Server:
+    """A serial device server in front of a port whose ends are joined (a pty has no DTR to set)."""
+
+    def __init__(self) -> None:
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"rfc2217://127.0.0.1:{self._server.getsockname()[1]}"
+        self._device = serial.serial_for_url("loop://", timeout=0.02)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def write(self, data: bytes) -> None:
+        """As PortManager wants its connection to be."""
+        self._client.sendall(data)
+
+    def _run(self) -> None:
+        self._client, _ = self._server.accept()
+        self._client.settimeout(0.02)
+        manager = rfc2217.PortManager(self._device, self)
+        while not self._stop.is_set():
+            with contextlib.suppress(TimeoutError):
+                self._device.write(b"".join(manager.filter(self._client.recv(1024))))
+            self.write(b"".join(manager.escape(self._device.read(64))))
+        self._client.close()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._device.close()
+        self._server.close()
+
+
+@pytest.mark.filterwarnings(r"ignore:set(Daemon|Name)\(\) is deprecated")  # pyserial's own
+def test_a_networked_port_that_passes_the_baud_rate_on() -> None:
+    server = Rfc2217Server()
+    port = SerialPort("stage", server.url, 57600)
+    port.open()
+    assert server._device.baudrate == 57600
+    port.write(b"<Idle>\xff\n")
+    assert read_exactly(port, 8) == b"<Idle>\xff\n"
+    server.close()
+    with pytest.raises(DeviceLost):
+        while_open(port)
+    port.close()
+
+
+def while_open(port: SerialPort) -> None:
+    while True:
+        port.read()
+
+
 def test_lines_carry_the_time_of_their_first_byte(ptys: list[Pty]) -> None:
     port, clock, arrived = SerialPort("stage", ptys[0].path, 115200), RealClock(), threading.Event()
     port.open()
@@ -202,7 +261,7 @@ def test_lines_carry_the_time_of_their_first_byte(ptys: list[Pty]) -> None:
     time.sleep(0.05)
     between = clock.now_ns()
     os.write(ptys[0].master, b"le>\r\n\xff\xfe\r\nok\n" + b"x" * (LONGEST_LINE + 10))
-    lines = []
+    lines: list[tuple[int, str]] = []
     while len(lines) < 4:
         arrived.wait(5)
         arrived.clear()
@@ -220,3 +279,41 @@ def test_lines_carry_the_time_of_their_first_byte(ptys: list[Pty]) -> None:
     assert isinstance(reader.error, DeviceLost)
     reader.close()
     port.close()
+
+
+def test_attached_boards_have_names_that_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def port(device: str, vid: int | None, pid: int, number: str | None) -> Any:
+        info = ListPortInfo(device)
+        info.vid, info.pid, info.serial_number, info.product = vid, pid, number, "a board"
+        return info
+
+    nodes = {name: tmp_path / name for name in ("ttyUSB0", "ttyUSB1", "ttyACM0", "ttyS0")}
+    for node in nodes.values():
+        node.touch()
+    by_id, by_socket = tmp_path / "by-id", tmp_path / "umbra"
+    for folder in (by_id, by_socket):
+        folder.mkdir()
+    (by_id / "usb-FTDI_A50285BI").symlink_to(nodes["ttyUSB0"])
+    (by_id / "usb-1a86_USB_Serial").symlink_to(nodes["ttyUSB1"])  # shared by all of its kind
+    (by_socket / "serial-at-2").symlink_to(nodes["ttyUSB1"])
+    monkeypatch.setattr(serialport, "BY_ID", by_id)
+    monkeypatch.setattr(serialport, "BY_SOCKET", by_socket)
+    monkeypatch.setattr(
+        list_ports,
+        "comports",
+        lambda: [
+            port(str(nodes["ttyUSB0"]), 0x0403, 0x6001, "A50285BI"),
+            port(str(nodes["ttyUSB1"]), 0x1A86, 0x7523, None),
+            port(str(nodes["ttyACM0"]), 0x2A3C, 0x0100, "T1"),
+            port(str(nodes["ttyS0"]), None, 0, None),
+        ],
+    )
+    assert [d["options"]["port"] for d in GrblStage.discover()] == [
+        str(by_id / "usb-FTDI_A50285BI"),
+        str(by_socket / "serial-at-2"),
+    ]
+    assert [(d["serial"], d["options"]["port"]) for d in TmclStage.discover()] == [
+        ("T1", "usb:2a3c:0100:T1")
+    ]

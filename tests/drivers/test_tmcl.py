@@ -32,7 +32,7 @@ pytestmark = pytest.mark.timeout(20)
 
 R = 3.0
 TURN = 200 << 8
-FEED = 15.0
+FEED = 45.0
 
 
 @pytest.fixture
@@ -209,7 +209,7 @@ def test_the_counters_overflow_does_not_move_the_stage(peer: TmclPeer, homed: Tm
 
 
 def test_hold_and_resume(peer: TmclPeer, homed: TmclStage) -> None:
-    homed.circle((10.0, 5.0), R, 30.0, 1)
+    homed.circle((10.0, 5.0), R, 45.0, 1)
     pump_until(homed, lambda s: peer.position > 1000)
     homed.hold()
     assert homed.status().state is StageState.HELD
@@ -233,8 +233,8 @@ def test_damaged_and_dropped_answers_are_asked_for_again(peer: TmclPeer, homed: 
     for fault in ("drop", "damage"):
         setattr(peer.faults, fault, 2)
         assert homed.status().state is StageState.IDLE
-    peer.faults.before = [rng.randbytes(rng.randrange(1, 30)) for _ in range(30)]
-    for _ in range(15):
+    peer.faults.before = [rng.randbytes(rng.randrange(1, 30)) for _ in range(16)]
+    for _ in range(8):
         assert homed.status().position_mm == pytest.approx(point(0.0), abs=1e-6)
     peer.faults.damage = 1000
     with pytest.raises(DeviceGarbled, match="damaged"):

@@ -39,7 +39,7 @@ class TmclPeer:
         self.module = module
         self.axis = {140: resolution, 4: 20_000, 154: 5}
         self.position = 1234.0
-        self.acceleration = 400_000.0  # microsteps a second squared
+        self.acceleration = 2_000_000.0  # microsteps a second squared
         self._speed = 0.0
         self._wanted = 0.0
         self._target: int | None = None
@@ -145,7 +145,7 @@ class TmclPeer:
 
     def _search(self, kind: int) -> int:
         if kind == 0:
-            self._search_until = time.monotonic() + (1e9 if self.faults.no_reference else 0.2)
+            self._search_until = time.monotonic() + (1e9 if self.faults.no_reference else 0.05)
         elif kind == 1:
             self._search_until = None
         return int(self._search_until is not None)
