@@ -35,6 +35,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "The rig": {
         "status": ("rig:status", "What the rig is doing now."),
         "devices": ("rig:devices", "The devices and their health."),
+        "doctor": ("doctor:doctor", "What is wrong with the rig, and what to do about it."),
         "methods": ("rig:methods", "The scan methods that the daemon knows."),
         "log": ("rig:log", "The last log records of a run, or of the daemon."),
         "stop": ("rig:stop", "Emergency stop: safe state now, until `umbra reset`."),
