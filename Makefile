@@ -36,7 +36,7 @@ bench: $(VENV)/.dev  ## the promises as ratios: a table, and bench.json
 	$(BIN)/python -m tests.benchmarks $(ARGS)
 
 extra-%: $(VENV)/.dev
-	$(call install,.[dev,$*])
+	$(call install,.[$*])
 
 clean:  ## remove all that the other targets made
 	rm -rf $(VENV) demo-out bench.json build dist *.egg-info

@@ -31,6 +31,7 @@ from daemon.frames import FrameRecord, FrameStore, NoPixels
 from daemon.preview import side_by_side
 from daemon.quality import BITS, overlay
 from daemon.separation.estimator import Components, Lighting, Measurement, Result
+from daemon.separation.single import block_mean
 from daemon.staging import Staging, as_json, encoded, tiff
 from daemon.store import RunFolder
 from drivers.base import PixelFormat
@@ -172,8 +173,8 @@ def compare(
     """Root-mean-square differences from the truth as fractions of full scale.
 
     Over the pixels without any quality bit, and over all (`..._all`); samples that are NaN in
-    either are left out of both. None where no sample is left. Raises ValueError for a truth of
-    another shape.
+    either are left out of both. None where no sample is left. A truth of a multiple of the size is
+    averaged over squares. Raises ValueError for one of another shape.
     """
     good = components.quality == 0
     found: dict[str, Any] = {
@@ -181,9 +182,12 @@ def compare(
         "over": "pixels with no quality bit; *_all: all pixels; NaN left out",
     }
     for name, plane in (("direct", components.direct), ("global", components.global_)):
-        if truth[name].shape != plane.shape:
+        true = truth[name]
+        if true.shape[0] > plane.shape[0]:  # a method of lower resolution
+            true = block_mean(true, true.shape[0] // plane.shape[0])
+        if true.shape != plane.shape:
             raise ValueError(f"true {name} has shape {truth[name].shape}, not {plane.shape}")
-        difference = (plane - truth[name]) / np.float32(full_scale)
+        difference = (plane - true) / np.float32(full_scale)
         found[f"rmse_{name}"] = _rms(difference[good])
         found[f"rmse_{name}_all"] = _rms(difference)
     return found

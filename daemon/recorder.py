@@ -11,6 +11,7 @@ waits for a buffer, a video scan that finds none records a gap (see `daemon.sequ
 
 from __future__ import annotations
 
+import contextvars
 import queue
 import threading
 import time
@@ -70,6 +71,14 @@ def _iso(utc_ns: int) -> str:
     return datetime.fromtimestamp(utc_ns / NS, UTC).isoformat(timespec="microseconds")
 
 
+def _worker(
+    name: str, guard: Callable[[Callable[[], None]], None], work: Callable[[], None]
+) -> threading.Thread:
+    """A thread in the maker's context, so that its log records carry the run's id."""
+    context = contextvars.copy_context()
+    return threading.Thread(target=context.run, args=(guard, work), name=name)
+
+
 class Recorder:
     """The two workers of one run. Any failure of theirs is raised by the next call of `put`.
 
@@ -102,8 +111,8 @@ class Recorder:
             queue.Queue(maxsize=ring.count + 8)
         )
         self._threads = (
-            threading.Thread(target=self._guard, args=(self._record,), name="umbra-recorder"),
-            threading.Thread(target=self._guard, args=(self._separate,), name="umbra-separator"),
+            _worker("umbra-recorder", self._guard, self._record),
+            _worker("umbra-separator", self._guard, self._separate),
         )
 
     # ------------------------------------------------------------ for the sequencer

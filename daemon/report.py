@@ -109,6 +109,7 @@ def advice(subject: Subject) -> list[str]:
         lines.append(f"{_frames(file.missing)} missing: see below why, then scan again.")
     if file.rejected:
         lines.append(f"{_frames(file.rejected)} recorded but not used: see below why.")
+    lines += facts.get("advice", [])  # the estimator's own
     for bit in _seen(facts):
         share = _share(facts, bit.name)
         if share >= _ADVISED_FROM:

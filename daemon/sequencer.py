@@ -8,9 +8,9 @@ ends, so that readout and flip go on side by side:
     camera             |expose k| readout k |expose k+1|
 
 A frame counts only if its exposure lies wholly within the time in which its pattern was lit, by
-the device's own time stamps. One that does not, that is incomplete, or that did not come in time
-is exposed again, `attempts` times in all; then it is an explicit missing record. Repeating is safe
-because a frame that is not recorded has no effect.
+the device's own time stamps, and if it looks like its pattern (`daemon.proof`). One that does not,
+that is incomplete, or that did not come in time is exposed again, `attempts` times in all; then it
+is an explicit missing record. Repeating is safe because a frame that is not recorded has no effect.
 
 Of the rig's calibration two things are applied here: the light is this pattern's only `latency_s`
 after the projector said so, and images are drawn through the inverse of its `tone`.
@@ -31,6 +31,7 @@ from daemon.config import SequencerSection
 from daemon.control import Control
 from daemon.devicethread import Session, Stuck
 from daemon.patterns import predistorted, render
+from daemon.proof import Proof
 from daemon.recorder import Exposed, Recorder
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Buffer, Ring
@@ -71,6 +72,7 @@ class _Exposure:
     sub: int
     lit_ns: int  # from when the light was the pattern's
     dark_ns: int  # until when it was; 0: it still is
+    image: NDArray[np.uint8] | None  # what the projector was given
     end_ns: int  # when the camera said that the exposure would end
     buffer: Buffer
     grab: Future[Frame]
@@ -116,6 +118,8 @@ class Sequencer:
         self._exposure_us = self._camera.device.settings().exposure_us
         self._lit: Expose | None = None
         self._lit_ns = 0
+        self._lit_image: NDArray[np.uint8] | None = None
+        self._looks = Proof() if method.looked_at else None
 
     def run(self, step_index: int, sub: int, taken: int) -> None:
         """All steps from `step_index`/`sub` on; `taken` frames were had before.
@@ -206,9 +210,11 @@ class Sequencer:
         elif step.pattern is None:
             self._projector.call(lambda p: p.safe(), SAFE_S, self._session)
             self._lit_ns = self._clock.now_ns() + self._latency_ns
+            self._lit_image = None
         else:
-            image = self._image(step)
-            flipped = self._projector.call(lambda p: p.show(image), SHOW_S, self._session)
+            image = self._lit_image = self._image(step)
+            sent = image if self._tone is None else predistorted(image, self._tone)
+            flipped = self._projector.call(lambda p: p.show(sent), SHOW_S, self._session)
             self._lit_ns = flipped + self._latency_ns
 
     def _image(self, step: Expose) -> NDArray[np.uint8]:
@@ -216,10 +222,7 @@ class Sequencer:
         assert step.pattern is not None
         if self._drawn is None or self._drawn[0] != step.pattern:
             info = self._projector.device.info()
-            image = render(step.pattern, info.width, info.height)
-            if self._tone is not None:
-                image = predistorted(image, self._tone)
-            self._drawn = (step.pattern, image)
+            self._drawn = (step.pattern, render(step.pattern, info.width, info.height))
         return self._drawn[1]
 
     def _draw_ahead(self, index: int) -> None:
@@ -244,7 +247,9 @@ class Sequencer:
         grab = self._camera.submit(
             lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, self._session
         )
-        return _Exposure(index, step, sub, self._lit_ns, 0, end_ns, buffer, grab, attempt)
+        return _Exposure(
+            index, step, sub, self._lit_ns, 0, self._lit_image, end_ns, buffer, grab, attempt
+        )
 
     def _frame_deadline(self) -> float:
         exposure_us = self._camera.device.settings().exposure_us or 0.0
@@ -305,7 +310,7 @@ class Sequencer:
         self._acquire(Acquisition.SOFTWARE)
 
     def _proof(self, exposure: _Exposure, frame: Frame) -> str:
-        """Why the frame may show more or less than its pattern, by its time stamps; "" if not."""
+        """Why the frame may show more or less than its pattern, by time stamps and looks; or ""."""
         if frame.incomplete:
             return "the frame is incomplete"
         if self._projector is None:
@@ -316,7 +321,9 @@ class Sequencer:
         if exposure.dark_ns and frame.end_ns > exposure.dark_ns:
             late = (frame.end_ns - exposure.dark_ns) / NS * 1e3
             return f"the exposure ended {late:.2f} ms after its pattern was taken down"
-        return ""
+        if self._looks is None:
+            return ""
+        return self._looks.problem(frame.pixels, exposure.step, exposure.image)
 
     # ------------------------------------------------------------ video steps
 

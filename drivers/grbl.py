@@ -35,15 +35,22 @@ from drivers.base import (
 )
 from drivers.clock import NS
 from drivers.grbl_link import REPLY_S, GrblLink
+from drivers.grbl_motion import (
+    MODES,
+    Limits,
+    Range,
+    Stream,
+    arcs,
+    jog,
+    line,
+    machine_travel,
+)
 from drivers.serialport import SerialPort
 from drivers.track import Arc, Point, Track
 
-MODES = "G21G17G94G90"  # mm, XY plane, feed in mm/min, absolute: set after each reset
 ACCEPT_S = 2.0  # a first motion line is acknowledged within milliseconds
 KEPT_MM = 0.002  # a position is reported to .001 mm: this near is the same
 SETTLE_S = 1.0  # a hold, beyond the time of its deceleration
-
-Range = tuple[float, float]
 
 
 def _stands(report: grbl.Report) -> bool:
@@ -81,13 +88,14 @@ class GrblStage(Stage):
         self.options = options
         self._link = GrblLink(SerialPort(name, options.port, options.baud), context.clock)
         self._link.on_report = self._on_report
+        self._link.on_lost = self._position_lost
         self._track = Track()
         self._arcs: deque[Arc] = deque(maxlen=4)  # those of lines that may be under way
-        self._pending: deque[Iterator[str]] = deque()  # motions whose lines are not all sent
-        self._next_line: str | None = None
+        self._stream = Stream(self._link)
         self._travelling = False  # from the first line of a motion until it is known to rest
         self._homed = False
         self._homing = False
+        self._halted_by_reset = False
         self._offset: Point = options.origin_mm  # machine position of the stage's origin
         self._info: StageInfo | None = None
         self._identity: Identity | None = None
@@ -128,7 +136,8 @@ class GrblStage(Stage):
         link.rx_bytes = min(self._build.rx_bytes, 256) - 1
         link.scale = grbl.MM_PER_INCH if self._settings.get(13) else 1.0
         wanted = self.options.identity
-        if wanted and not any(wanted in line for line in said):
+        # Grbl keeps its label in capitals, whatever was sent
+        if wanted and not any(wanted.lower() in text.lower() for text in said):
             raise DeviceRefused(
                 self.name,
                 "connect",
@@ -157,12 +166,15 @@ class GrblStage(Stage):
         """Travel, feed and acceleration from $110..$131 and the options; see `info`."""
         settings, options = self._settings, self.options
         travel = options.travel_mm
+        if travel is None and options.homing == "switches":
+            x, y = (machine_travel(settings, self._build, axis) for axis in (0, 1))
+            (x0, y0) = options.origin_mm
+            if x is not None and y is not None:
+                travel = (x[0] - x0, x[1] - x0), (y[0] - y0, y[1] - y0)
         if travel is None:
-            if options.homing == "here" or not {130, 131} <= settings.keys():
-                raise DeviceRefused(
-                    self.name, "connect", "its travel is not known", "set travel_mm in rig.toml"
-                )
-            travel = (self._axis_travel(0), self._axis_travel(1))
+            raise DeviceRefused(
+                self.name, "connect", "its travel is not known", "set travel_mm in rig.toml"
+            )
         if not all(low < high for low, high in travel):
             raise DeviceRefused(self.name, "connect", f"travel_mm {travel} is empty", "mend it")
         rates = [settings[n] / 60 for n in (110, 111) if settings.get(n, 0) > 0]
@@ -173,15 +185,6 @@ class GrblStage(Stage):
             )
         acceleration = min((settings[n] for n in (120, 121) if n in settings), default=0.0)
         return StageInfo(travel, min([feed, *rates]), acceleration)
-
-    def _axis_travel(self, axis: int) -> Range:
-        """Grbl homes to 0 at an end: travel is negative, unless built to set the origin (Z)."""
-        length = self._settings[130 + axis]
-        homes_low = int(self._settings.get(23, 0)) >> axis & 1
-        sets_origin = "Z" in self._build.options or int(self._settings.get(22, 0)) & 8
-        low = 0.0 if sets_origin and homes_low else -length
-        origin = self.options.origin_mm[axis]
-        return low - origin, low + length - origin
 
     def check(self) -> None:
         """One status query. Raises DeviceRefused for an alarm that nobody has acknowledged."""
@@ -196,11 +199,12 @@ class GrblStage(Stage):
 
     def halt(self) -> None:
         """Feed hold; while homing, which ignores it, a reset. See Device."""
+        self._halted_by_reset = self._homing
         self._link.urge(grbl.RESET if self._homing else grbl.HOLD)
 
     def close(self) -> None:
         """See Device. What moves is held first: nobody would hear of its end."""
-        if self._link.port.is_open and (self._travelling or self._pending):
+        if self._link.port.is_open and self._travelling:
             self._link.urge(grbl.HOLD)
         self._link.close()
         self._position_lost()
@@ -238,7 +242,7 @@ class GrblStage(Stage):
             return self._status()
         self._ask("status")
         for _ in range(3):  # Idle is believed at its second report only
-            if not self._travelling or self._link.in_flight or self._pending or self._at_rest():
+            if self._link.in_flight or self._at_rest():
                 break
             self._ask("status")
         return self._status()
@@ -278,8 +282,7 @@ class GrblStage(Stage):
 
     def _abandon(self) -> None:
         """Forget motions that are not sent yet."""
-        self._pending.clear()
-        self._next_line = None
+        self._stream.clear()
         self._travelling = False
 
     def _ask(self, phase: str) -> grbl.Report:
@@ -310,7 +313,7 @@ class GrblStage(Stage):
             self._arcs.clear()
 
     def _at_rest(self) -> bool:
-        return not self._pending and (self._link.quiet or not self._travelling)
+        return self._stream.empty and (self._link.quiet or not self._travelling)
 
     def _locked(self) -> bool:
         """In the lock of a power-up or an alarm, by a fresh report."""
@@ -365,6 +368,7 @@ class GrblStage(Stage):
         link = self._link
         self._position_lost()
         link.alarm = None
+        self._halted_by_reset = False
         self._homing = True
         try:
             link.command("$H", timeout_s, "home")
@@ -380,8 +384,8 @@ class GrblStage(Stage):
                 "check that both axes turn; raise the time, or $25 (seek rate)",
             ) from None
         except DeviceError:
-            if link.interrupted:  # the halt's reset may have come before the `$H`
-                link.urge(grbl.RESET)
+            if link.interrupted and not self._halted_by_reset:
+                link.urge(grbl.RESET)  # the halt came before the `$H`: it has only held
             raise
         finally:
             self._homing = False
@@ -446,6 +450,7 @@ class GrblStage(Stage):
     def _clear_for(self, phase: str) -> None:
         """Bring it to where `$H` and `$X` are heard: nothing queued, no critical alarm."""
         self._abandon()
+        self._link.await_banner(phase)
         if self._link.alarm in {1, 2}:
             self._position_lost()
             self._link.reset(phase)  # it hears nothing else
@@ -458,11 +463,9 @@ class GrblStage(Stage):
     def move(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
         """See Stage. Not safe to send again after DeviceTimeout: ask for the status first."""
         self._begin("move")
-        self._check_feed("move", feed_mm_s)
-        self._check_range("move", 0, x_mm, x_mm)
-        self._check_range("move", 1, y_mm, y_mm)
+        target = self._checked("move", (x_mm, y_mm), feed_mm_s)
         self._ready("move")
-        self._start("move", iter([self._line_to(x_mm, y_mm, feed_mm_s)]))
+        self._start("move", iter([line(target, feed_mm_s)]))
 
     def jog(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
         """See Stage. Grbl's own jog: `hold` and `stop` end it at once, and lose nothing.
@@ -470,14 +473,11 @@ class GrblStage(Stage):
         Not safe to send again after DeviceTimeout.
         """
         self._begin("jog")
-        self._check_feed("jog", feed_mm_s)
-        self._check_range("jog", 0, x_mm, x_mm)
-        self._check_range("jog", 1, y_mm, y_mm)
+        target = self._checked("jog", (x_mm, y_mm), feed_mm_s)
         self._ready("jog")
         self._track.depart(self.clock.now_ns())
         self._travelling = True
-        target = self._line_to(x_mm, y_mm, feed_mm_s).replace("G1", "", 1)
-        self._link.command(f"$J={target}", REPLY_S, "jog")
+        self._link.command(jog(target, feed_mm_s), REPLY_S, "jog")
         self._raise_trouble("jog")
 
     def circle(self, centre_mm: Point, radius_mm: float, feed_mm_s: float, turns: float) -> None:
@@ -486,53 +486,29 @@ class GrblStage(Stage):
         Goes to the circle's first point, (x + r, y), in a straight line with the same feed.
         """
         self._begin("circle")
-        self._check_feed("circle", feed_mm_s)
-        if not (math.isfinite(radius_mm) and radius_mm > 0):
-            raise DeviceRefused(self.name, "circle", f"its radius is {radius_mm} mm", "above 0")
-        if not turns > 0:
-            raise DeviceRefused(self.name, "circle", f"{turns} turns were asked", "above 0")
-        for axis in (0, 1):
-            centre = centre_mm[axis]
-            self._check_range("circle", axis, centre - radius_mm, centre + radius_mm)
+        arc, limits = Arc(centre_mm, radius_mm), self._limits_known()
+        limits.check_feed("circle", feed_mm_s)
+        limits.check_circle("circle", arc, turns)
         self._ready("circle")
-        # Arcs are incremental: closed, so nothing adds up, and independent of work offsets
-        self._start("circle", self._turns(Arc(centre_mm, radius_mm), feed_mm_s, turns))
+        self._start("circle", self._round(arc, feed_mm_s, turns))
 
-    def _line_to(self, x: float, y: float, feed: float) -> str:
-        x, y = x + self._offset[0], y + self._offset[1]
-        return f"G53G1X{x:.4f}Y{y:.4f}F{feed * 60:.1f}"
-
-    def _turns(self, arc: Arc, feed: float, turns: float) -> Iterator[str]:
-        (x, y), r = arc.centre, arc.radius
+    def _round(self, arc: Arc, feed: float, turns: float) -> Iterator[str]:
         self._arcs.append(arc)
-        yield self._line_to(x + r, y, feed)
-        whole = turns if math.isinf(turns) else math.floor(turns + 1e-9)
-        done = 0
-        while done < whole:
-            yield f"G91G3X0Y0I{-r:.4f}J0F{feed * 60:.1f}"
-            done += 1
-        if not math.isinf(turns) and (rest := turns - whole) > 1e-4:
-            end = math.tau * rest
-            dx, dy = r * (math.cos(end) - 1), r * math.sin(end)
-            yield f"G91G3X{dx:.4f}Y{dy:.4f}I{-r:.4f}J0"
+        yield line(self._machine(arc.point(0.0)), feed)
+        yield from arcs(arc.radius, feed, turns)
 
-    def _check_feed(self, phase: str, feed: float) -> None:
-        limit = self.info().max_feed_mm_s
-        if not 0 < feed <= limit * (1 + 1e-9):
-            raise DeviceRefused(
-                self.name, phase, f"a feed of {feed:g} mm/s", f"it takes up to {limit:g} mm/s"
-            )
+    def _limits_known(self) -> Limits:
+        return Limits(self.name, self.info())
 
-    def _check_range(self, phase: str, axis: int, low: float, high: float) -> None:
-        least, most = self.info().travel_mm[axis]
-        for value in (low, high):
-            if not least <= value <= most:  # false for nan too
-                raise DeviceRefused(
-                    self.name,
-                    phase,
-                    f"{'xy'[axis]} = {value:g} mm is outside {least:g} to {most:g} mm, its travel",
-                    "nothing was sent; aim within the travel",
-                )
+    def _checked(self, phase: str, point: Point, feed: float) -> Point:
+        """The machine position of a point that may be gone to. Raises DeviceRefused."""
+        limits = self._limits_known()
+        limits.check_feed(phase, feed)
+        limits.check_box(phase, (point[0], point[0]), (point[1], point[1]))
+        return self._machine(point)
+
+    def _machine(self, point: Point) -> Point:
+        return point[0] + self._offset[0], point[1] + self._offset[1]
 
     def _ready(self, phase: str) -> None:
         """Raises DeviceRefused unless it may move now."""
@@ -554,11 +530,11 @@ class GrblStage(Stage):
 
     def _start(self, phase: str, lines: Iterator[str]) -> None:
         """Accept a motion; the first line of an idle stage is waited for, to hear a refusal."""
-        was_idle = not (self._travelling or self._pending or self._link.in_flight)
+        was_idle = not self._travelling and not self._link.in_flight
         self._track.depart(self.clock.now_ns())
         self._travelling = True
-        self._pending.append(lines)
-        self._feed()
+        self._stream.add(lines)
+        self._stream.feed()
         if was_idle:
             # the buffers are empty, so the first ok comes at once, or an error does
             count = self._link.in_flight
@@ -574,22 +550,7 @@ class GrblStage(Stage):
                     "it may have been made and is not sent again: `umbra stage status`",
                 )
             self._raise_trouble(phase)
-            self._feed()
-
-    def _feed(self) -> None:
-        """Send as many lines as the controller's buffer takes."""
-        while True:
-            if self._next_line is None:
-                while self._pending and self._next_line is None:
-                    self._next_line = next(self._pending[0], None)
-                    if self._next_line is None:
-                        self._pending.popleft()
-                if self._next_line is None:
-                    return
-            if not self._link.room(self._next_line):
-                return
-            line, self._next_line = self._next_line, None
-            self._link.send(line)
+            self._stream.feed()
 
     def pump(self) -> StageStatus:
         """See Stage. Never blocks: the report is the last one that came.
@@ -599,8 +560,7 @@ class GrblStage(Stage):
         """
         self._begin("pump")
         self._raise_trouble("pump")
-        if self._pending or self._next_line:
-            self._feed()
+        self._stream.feed()
         self._link.poll(1 / self.options.poll_hz)
         return self._status()
 
@@ -608,13 +568,13 @@ class GrblStage(Stage):
         self._raise_alarm(phase)
         refused = self._link.refused
         if refused is not None:
-            line, code = refused
+            text, code = refused
             self._abandon()
             self._travelling = True  # others may be under way
             self.stop()
             self._link.refused = None
             problem, remedy = grbl.refusal(code)
-            raise DeviceRefused(self.name, phase, f"{problem}: {line}", remedy)
+            raise DeviceRefused(self.name, phase, f"{problem}: {text}", remedy)
 
     def _raise_alarm(self, phase: str) -> None:
         if self._link.alarm is not None:
@@ -623,9 +583,9 @@ class GrblStage(Stage):
     def hold(self) -> None:
         """See Stage. Safe to send again. Returns when it stands: deceleration plus 1 s at most."""
         self._begin("hold")
-        self._halted("hold")
+        self._stand("hold")
 
-    def _halted(self, phase: str) -> grbl.Report:
+    def _stand(self, phase: str) -> grbl.Report:
         """Decelerate to a stand; the report that proves it. A jog ends in Idle, others in Hold."""
         sent = self._travelling or self._link.in_flight > 0
         if sent:
@@ -681,10 +641,10 @@ class GrblStage(Stage):
         and the same position after. In any other case it is unknown.
         """
         self._begin("stop")
-        self._abandon_unsent()
+        self._stream.clear()
         if self._link.alarm is not None:
             return
-        before = self._halted("stop")
+        before = self._stand("stop")
         if self._link.alarm is not None:
             return
         if before.state == "Idle" and not self._link.in_flight:
@@ -703,7 +663,3 @@ class GrblStage(Stage):
             self._position_lost()
             return
         self._settle("stop")
-
-    def _abandon_unsent(self) -> None:
-        self._pending.clear()
-        self._next_line = None

@@ -63,6 +63,7 @@ class GrblLink:
         self.strange = 0  # lines that made no sense
         self.strange_lines: deque[str] = deque(maxlen=STRANGE_KEPT)
         self.on_report: Callable[[grbl.Report], None] = lambda _report: None
+        self.on_lost: Callable[[], None] = lambda: None
         self._clock = clock
         self._arrived = threading.Event()
         self._interrupted = threading.Event()
@@ -141,6 +142,11 @@ class GrblLink:
             f"no answer from {where}",
             "check its power, the cable and the baud rate, and that it is Grbl 1.1",
         )
+
+    def await_banner(self, phase: str) -> None:
+        """After a reset that nobody waited for: it hears nothing before its banner."""
+        if self._awaiting_banner:
+            self.wait(lambda: not self._awaiting_banner, BANNER_S, phase)
 
     def settle_alarm(self, phase: str) -> None:
         """Most alarms end in a banner, which empties all buffers: wait for it where it comes."""
@@ -309,6 +315,7 @@ class GrblLink:
         while (item := reader.take()) is not None:
             self._digest(*item)
         if reader.error is not None:
+            self.on_lost()
             raise DeviceLost(
                 self.port.device, "read", reader.error.problem, "check cable and power; then home"
             ) from reader.error

@@ -67,7 +67,11 @@ def inspect(path: Path) -> ImageHeader:
 
 def read(path: Path) -> NDArray[Any]:
     """Samples (H, W) or (H, W, 3) RGB, uint8 or uint16; checked again. Raises BadImage."""
-    data = _bytes(path)
+    return decode(_bytes(path))
+
+
+def decode(data: bytes) -> NDArray[Any]:
+    """As `read`, of a file's bytes. Raises BadImage."""
     return _decode(data, _parser(data)(data))
 
 

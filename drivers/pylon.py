@@ -181,7 +181,7 @@ class PylonCamera(SfncCamera):
         except genicam.TimeoutException as error:
             raise DeviceTimeout(self.name, phase, _first_line(error), "try again") from error
         except genicam.GenericException as error:
-            self._still_there(phase, error)
+            self._still_there(phase)
             if phase == "connect" and isinstance(error, genicam.RuntimeException):
                 raise DeviceRefused(
                     self.name,
@@ -193,11 +193,9 @@ class PylonCamera(SfncCamera):
                 self.name, phase, _first_line(error), "choose another value, or connect again"
             ) from error
 
-    def _still_there(self, phase: str, cause: Exception | None = None) -> None:
+    def _still_there(self, phase: str) -> None:
         if self._camera is not None and self._camera.IsCameraDeviceRemoved():
-            raise DeviceLost(
-                self.name, phase, "it was unplugged", "plug it in, then connect again"
-            ) from cause
+            raise DeviceLost(self.name, phase, "it was unplugged", "plug it in, then connect again")
 
 
 def _enumerate(transport: str) -> list[Any]:

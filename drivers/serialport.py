@@ -176,7 +176,8 @@ class SerialPort:
         if port is None:
             raise DeviceLost(self.device, "read", "the port is closed")
         try:
-            return bytes(port.read(max(1, port.in_waiting)))
+            first = bytes(port.read(1))
+            return first + bytes(port.read(port.in_waiting)) if first else b""
         except (OSError, TypeError, ValueError) as error:
             # pyserial shows a port that was closed or pulled under a read as any of these
             raise DeviceLost(
@@ -206,6 +207,12 @@ class SerialPort:
         except DeviceError:
             return False
         return True
+
+    def cancel_read(self) -> None:
+        """From any thread: end a `read` under way, where the port can."""
+        cancel = getattr(self._serial, "cancel_read", None)
+        if cancel is not None:
+            cancel()
 
     def close(self) -> None:
         """Let go of the port; idempotent, does not raise for one that is gone."""
@@ -244,6 +251,7 @@ class LineReader:
     def close(self) -> None:
         """End the thread; the port's owner closes the port afterwards."""
         self._closing.set()
+        self._port.cancel_read()
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=5 * POLL_S)
 

@@ -69,6 +69,11 @@ class Nodes(ABC):
     def execute(self, name: str) -> None:
         """Run a command."""
 
+    def ensure(self, name: str, value: Value) -> None:
+        """Give it a value unless it has it: some cannot be written because they have no choice."""
+        if self.get(name) != value:
+            self.set(name, value)
+
     def first(self, names: tuple[str, ...]) -> str:
         """The first of these names that the camera has; "" if none."""
         return next((name for name in names if self.has(name)), "")
@@ -131,13 +136,13 @@ class SfncCamera(StreamingCamera):
         """A frame must depend on the light and on nothing else."""
         for name in ("ExposureAuto", "GainAuto", "BalanceWhiteAuto", "BlackLevelAuto"):
             if nodes.has(name) and "Off" in nodes.entries(name):
-                nodes.set(name, "Off")
+                nodes.ensure(name, "Off")
         if nodes.has("GammaEnable"):
-            nodes.set("GammaEnable", False)
+            nodes.ensure("GammaEnable", False)
         elif nodes.has("Gamma"):
-            nodes.set("Gamma", 1.0)
+            nodes.ensure("Gamma", 1.0)
         if nodes.has("ExposureMode") and "Timed" in nodes.entries("ExposureMode"):
-            nodes.set("ExposureMode", "Timed")
+            nodes.ensure("ExposureMode", "Timed")
 
     def _set_checked(self, nodes: Nodes, name: str, value: Value) -> None:
         if not nodes.has(name):
@@ -310,7 +315,7 @@ class SfncCamera(StreamingCamera):
     def _arm(self, acquisition: Acquisition) -> None:
         nodes = self._nodes("start")
         if nodes.has("AcquisitionMode"):
-            nodes.set("AcquisitionMode", "Continuous")
+            nodes.ensure("AcquisitionMode", "Continuous")
         free = acquisition is Acquisition.FREE
         rate = self._wanted.frame_rate_hz or self.options.frame_rate_hz
         self._limit_rate(nodes, on=free and rate is not None)
@@ -318,19 +323,19 @@ class SfncCamera(StreamingCamera):
             return  # free-running only
         if nodes.has("TriggerSelector"):
             for selector in nodes.entries("TriggerSelector"):
-                nodes.set("TriggerSelector", selector)
+                nodes.ensure("TriggerSelector", selector)
                 if nodes.has("TriggerMode"):
-                    nodes.set("TriggerMode", "Off")
-            nodes.set("TriggerSelector", "FrameStart")
+                    nodes.ensure("TriggerMode", "Off")
+            nodes.ensure("TriggerSelector", "FrameStart")
         if free:
-            nodes.set("TriggerMode", "Off")
+            nodes.ensure("TriggerMode", "Off")
             return
         hardware = acquisition is Acquisition.HARDWARE
-        nodes.set("TriggerSource", self.options.trigger_line if hardware else "Software")
+        nodes.ensure("TriggerSource", self.options.trigger_line if hardware else "Software")
         if hardware and nodes.has("TriggerActivation"):
             rising = self.options.trigger_edge == "rising"
-            nodes.set("TriggerActivation", "RisingEdge" if rising else "FallingEdge")
-        nodes.set("TriggerMode", "On")
+            nodes.ensure("TriggerActivation", "RisingEdge" if rising else "FallingEdge")
+        nodes.ensure("TriggerMode", "On")
 
     def _fire(self) -> None:
         self._nodes("trigger").execute("TriggerSoftware")

@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ from drivers.clock import NS
 from drivers.devicetime import DeviceTime
 from drivers.unpack import Layout, unpack
 
+WRAP = 65535  # GigE Vision's frame ids go from 1 to this
 HALT_SLICE_S = 0.02  # a wait inside a library cannot be woken: so long is it until `halt` is seen
 
 
@@ -64,7 +65,7 @@ class Buffer:
     data: NDArray[np.uint8]
     width: int
     height: int
-    block_id: int  # the camera's own count; GigE Vision's goes from 65535 to 1
+    block_id: int | None  # the camera's own count, GigE Vision's goes from 65535 to 1; None: unsaid
     device_ns: int  # on the camera's clock; 0: it has none
     release: Callable[[], None]
     stride: int | None = None  # bytes from row to row; None: rows follow without a gap
@@ -74,7 +75,7 @@ class Buffer:
 class StreamingCamera(Camera):
     """See the module. A driver implements the methods below `what a driver adds`."""
 
-    options_type = StreamingOptions
+    options_type: ClassVar[type[Options]] = StreamingOptions
     options: StreamingOptions
 
     def __init__(self, name: str, options: StreamingOptions, context: Context) -> None:
@@ -144,6 +145,9 @@ class StreamingCamera(Camera):
 
     def _ready(self) -> None:
         """Wait until the camera takes a trigger, where the library can tell."""
+
+    def _still_there(self, phase: str) -> None:
+        """Raise DeviceLost if no frame came because there is no camera any more."""
 
     # ------------------------------------------------------------ life
 
@@ -305,6 +309,7 @@ class StreamingCamera(Camera):
                 return buffer
             if left <= 0:
                 break
+        self._still_there("grab")
         self._late = self._acquisition is Acquisition.SOFTWARE
         remedies = {
             Acquisition.SOFTWARE: "trigger again",
@@ -331,11 +336,18 @@ class StreamingCamera(Camera):
                 "does another program control it? connect again",
             )
 
-    def _count(self, block_id: int) -> int:
+    def _count(self, block_id: int | None) -> int:
         """The frame's number since `start`, lost ones counted."""
-        step = 1 if self._last_id is None else block_id - self._last_id
-        self._last_id = block_id
-        self._sequence += step if step > 0 else step + 65535
+        step = 1
+        if block_id is not None and self._last_id is not None:
+            step = block_id - self._last_id
+            if step < -WRAP // 2:
+                step += WRAP
+        if block_id is not None:
+            self._last_id = block_id
+        elif self._last_id is not None:
+            self._last_id = self._last_id % WRAP + 1 if self._last_id <= WRAP else self._last_id + 1
+        self._sequence += max(step, 1)
         return self._sequence
 
     # ------------------------------------------------------------ time

@@ -44,10 +44,10 @@ from drivers.serialport import SerialPort
 from drivers.track import Arc, Point, Track
 
 FRAME = 9
-REPLY_S = 0.3  # a module answers within 5 ms
+REPLY_S = 0.2  # a module answers within 5 ms
 ATTEMPTS = 3
 NEAR_MM = 0.05  # a target this near to the circle is on it
-POLL_S = 0.05
+POLL_S = 0.02
 STALL_S = 1.0  # a motor that was told to turn has begun by then
 
 

@@ -88,6 +88,21 @@ class Health(enum.StrEnum):
     STUCK = "stuck"  # a call into its driver has not come back in time
 
 
+class StageState(enum.StrEnum):
+    """What a stage is doing. Unknown: its position is not known, and only homing is allowed.
+
+    unknown ──home──> homing ──> idle <──> moving | held;  any ──> alarm ──unlock──> unknown
+    any ──reconnect──> unknown
+    """
+
+    UNKNOWN = "unknown"
+    HOMING = "homing"
+    IDLE = "idle"
+    MOVING = "moving"
+    HELD = "held"
+    ALARM = "alarm"
+
+
 # ---------------------------------------------------------------- facts
 
 
@@ -350,6 +365,51 @@ class SetLight(Command, frozen=True, kw_only=True, tag="light"):
     on: bool
 
 
+class GetStage(Command, frozen=True, kw_only=True, tag="stage"):
+    """Where the stage is and what it is doing."""
+
+
+class StageHome(Command, frozen=True, kw_only=True, tag="stage-home"):
+    """Find the stage's origin; answered at once, the end shows in `stage`."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    timeout_s: Annotated[float, Meta(gt=0, le=600)] = 60.0
+
+
+class StageMove(Command, frozen=True, kw_only=True, tag="stage-move"):
+    """Go straight to a point, mm; refused outside the travel. Answered when accepted."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+    x_mm: float
+    y_mm: float
+    feed_mm_s: Annotated[float, Meta(gt=0)]
+
+
+class StageCircle(Command, frozen=True, kw_only=True, tag="stage-circle"):
+    """Go round a circle, counter-clockwise; refused if any of it is outside the travel.
+
+    `turns` None goes on until `stage-stop`. Answered when accepted.
+    """
+
+    role: ClassVar[Role] = Role.OPERATOR
+    centre_mm: tuple[float, float]
+    radius_mm: Annotated[float, Meta(gt=0)]
+    feed_mm_s: Annotated[float, Meta(gt=0)]
+    turns: Annotated[float, Meta(gt=0)] | None = None
+
+
+class StageStop(Command, frozen=True, kw_only=True, tag="stage-stop"):
+    """End every motion of the stage, which then holds; nothing is left to resume."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+
+
+class StageUnlock(Command, frozen=True, kw_only=True, tag="stage-unlock"):
+    """Leave the stage's alarm without homing; its position stays unknown."""
+
+    role: ClassVar[Role] = Role.OPERATOR
+
+
 class Dark(Command, frozen=True, kw_only=True, tag="dark"):
     """End manual work: projector dark, lights off, stage held."""
 
@@ -385,7 +445,8 @@ class Unlock(Command, frozen=True, kw_only=True, tag="unlock"):
 AnyCommand = (
     Hello | GetStatus | GetDevices | Submit | GetQueue | MoveQueued | Pause | Resume | Abort
     | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct | GetLog | GetPreview | Show
-    | Snap | SetCamera | SetLight | Dark | Lock | RenewLock | Unlock
+    | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove | StageCircle
+    | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
 )  # fmt: skip
 
 
@@ -479,6 +540,16 @@ class Camera(Reply, frozen=True, kw_only=True, tag="camera"):
     settings: CameraSettings
 
 
+class StageStatus(Reply, frozen=True, kw_only=True, tag="stage"):
+    """Answer to all that is about the stage. `position_mm` is None while it is unknown."""
+
+    state: StageState
+    position_mm: tuple[float, float] | None
+    travel_mm: tuple[tuple[float, float], tuple[float, float]]  # (x min, max), (y min, max)
+    max_feed_mm_s: float
+    detail: str = ""  # which alarm, what holds it, and the remedy
+
+
 class Locked(Reply, frozen=True, kw_only=True, tag="locked"):
     """Answer to `lock`: send the token with every request."""
 
@@ -494,7 +565,7 @@ class Done(Reply, frozen=True, kw_only=True, tag="done"):
 
 AnyReply = (
     Welcome | Status | Devices | Run | Runs | Result | ProductPart | Log | Picture | Camera
-    | Locked | Done
+    | StageStatus | Locked | Done
 )  # fmt: skip
 
 ANSWERS: dict[type[Command], type[Reply]] = {
@@ -519,6 +590,12 @@ ANSWERS: dict[type[Command], type[Reply]] = {
     Snap: Picture,
     SetCamera: Camera,
     SetLight: Done,
+    GetStage: StageStatus,
+    StageHome: StageStatus,
+    StageMove: StageStatus,
+    StageCircle: StageStatus,
+    StageStop: StageStatus,
+    StageUnlock: StageStatus,
     Dark: Done,
     Lock: Locked,
     RenewLock: Locked,

@@ -18,11 +18,12 @@ import msgspec
 from msgspec import inspect as mi
 
 from protocol import messages as m
+from protocol import patterns, scans
 from protocol.connection import ATTEMPTS, EVENTS_HWM, PREVIEWS_HWM
 from protocol.errors import Code, ErrorInfo
 from protocol.following import SILENCE_S
-from protocol.patterns import AnyPattern
-from protocol.scans import AnyScan, Radiometry, Reference
+from protocol.patterns import AnyBinary, AnyPattern
+from protocol.scans import AnyScan, Radiometry
 from protocol.wire import encode
 
 CLIENT = """\
@@ -118,6 +119,7 @@ _UNIONS = {
     "any event": m.AnyEvent,
     "any scan": AnyScan,
     "any pattern": AnyPattern,
+    "a two-valued pattern": AnyBinary,
 }
 _SECTIONS = {
     "any command": "commands",
@@ -125,6 +127,7 @@ _SECTIONS = {
     "any event": "events",
     "any scan": "scans",
     "any pattern": "patterns",
+    "a two-valued pattern": "patterns",
 }
 
 
@@ -278,6 +281,15 @@ def _facts() -> Iterator[Struct]:
             yield cls
 
 
+def _choices() -> Iterator[type[enum.StrEnum]]:
+    """The enums that scans and patterns are made of, in the sources' order."""
+    for module in (scans, patterns):
+        for cls in vars(module).values():
+            mine = isinstance(cls, type) and cls.__module__ == module.__name__
+            if mine and issubclass(cls, enum.StrEnum):
+                yield cls
+
+
 # ---------------------------------------------------------------- the page
 
 
@@ -356,7 +368,7 @@ their own {PREVIEWS_HWM} previews; they ask when they have heard nothing for {SI
 ## States
 
 """
-    for states in (m.RunState, m.RigState, m.Health, m.Role):
+    for states in (m.RunState, m.RigState, m.Health, m.StageState, m.Role):
         yield from _enum(states)
     yield "## Commands\n"
     yield "| command | least role | answer | |"
@@ -381,7 +393,8 @@ their own {PREVIEWS_HWM} previews; they ask when they have heard nothing for {SI
     yield "## Facts\n\nParts of the above.\n"
     for fact in _facts():
         yield from _struct(fact)
-    yield from _enum(Reference)
+    for choices in _choices():
+        yield from _enum(choices)
     yield "## Errors\n"
     yield from _struct(ErrorInfo)
     yield from _enum(Code)

@@ -12,6 +12,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from protocol.patterns import Axis
+
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 Leak = Annotated[float, Meta(ge=0.0, lt=1.0)]
 LitFraction = Annotated[float, Meta(gt=0.0, le=1.0, description="lit fraction α of the source")]
@@ -25,8 +27,14 @@ ToneCurve = Annotated[
     ),
 ]
 
+Period = Annotated[float, Meta(ge=2.0, le=65_536.0)]  # projector pixels
+Phases = Annotated[int, Meta(ge=3, le=1000, description="phases of each period, a whole turn")]
+Patch = Annotated[int, Meta(ge=1, le=1024, description="side of a patch in projector pixels")]
+Seed = Annotated[int, Meta(ge=0, le=2**53, description="of the random numbers")]
+
+AXIS = "axis along which the pattern varies: x makes vertical stripes"
 LEAKAGE = "brightness b of an unlit source element as a fraction of a lit one"
-ESTIMATOR = "how frames become components; maxmin is the paper's"
+ESTIMATOR = "how frames become components; maxmin is the paper's, auto the best for the method"
 
 
 class Reference(enum.StrEnum):
@@ -78,7 +86,9 @@ class PatternScan(Scan, frozen=True, kw_only=True):
 
     average: Annotated[Count, Meta(description="frames averaged a pattern (the paper: 32)")] = 1
     lit_fraction: LitFraction | None = None  # None: the pattern's own
-    estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
+    estimator: Annotated[Literal["auto", "maxmin", "topk", "lsq"], Meta(description=ESTIMATOR)] = (
+        "auto"
+    )
 
 
 class Checkerboard(PatternScan, frozen=True, kw_only=True, tag="checkerboard"):
@@ -101,6 +111,65 @@ class Stick(Scan, frozen=True, kw_only=True, tag="stick"):
     lit_fraction: LitFraction = 1.0
     frames: Annotated[Count, Meta(description="frames to take")] | None = None  # None: to the end
     estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
+
+
+class Sinusoid(PatternScan, frozen=True, kw_only=True, tag="sinusoid"):
+    """sin(x + sin y) shifted along x (§4.3): N >= 3 phases of each period.
+
+    Several periods give as many independent separations, which are averaged and compared, and
+    (with no weave) an absolute projector coordinate. Frames come period by period.
+    """
+
+    periods: Annotated[
+        tuple[Period, ...],
+        Meta(min_length=1, max_length=16, description="periods in projector pixels"),
+    ] = (16.0,)
+    phases: Phases = 3
+    axis: Annotated[Axis, Meta(description=AXIS)] = Axis.X
+    weave: Annotated[
+        float, Meta(description="phase swing along the other axis, radians; 0: plain stripes")
+    ] = 1.0
+
+
+class RandomPhase(PatternScan, frozen=True, kw_only=True, tag="random-phase"):
+    """Each patch of projector pixels a sinusoid in time with a phase of its own (§4.3)."""
+
+    patch: Patch = 4
+    phases: Phases = 3
+    seed: Seed = 1
+
+
+class GrayCode(PatternScan, frozen=True, kw_only=True, tag="gray-code"):
+    """Gray code and its inverses (§4.3): direct and global from the finest stripes that each pixel
+    resolves, and the projector coordinate of each pixel. The coarsest bit comes first."""
+
+    axes: Annotated[
+        tuple[Axis, ...], Meta(min_length=1, max_length=2, description="coded axes: x, y or x,y")
+    ] = (Axis.X,)
+    bits: (
+        Annotated[int, Meta(ge=1, le=16, description="bits an axis (a recording's must be told)")]
+        | None
+    ) = None  # None: as many as the projector's size takes
+
+
+class RandomBinary(PatternScan, frozen=True, kw_only=True, tag="random-binary"):
+    """Random binary patterns in which each patch is lit equally often (§3.5)."""
+
+    patch: Patch = 6
+    patterns: Annotated[int, Meta(ge=2, le=1000, description="images")] = 20
+    seed: Seed = 1
+
+
+class SingleImage(PatternScan, frozen=True, kw_only=True, tag="single-image"):
+    """One image under fine stripes (§4.4): the peaks and valleys in a window across the stripes are
+    interpolated, and averaged over squares: components at 1/reduce of the camera's resolution."""
+
+    stripe: Annotated[int, Meta(ge=1, le=1024, description="width of a stripe, px")] = 2
+    axis: Annotated[Axis, Meta(description=AXIS)] = Axis.X
+    window: Annotated[int, Meta(ge=3, le=1001, description="n, camera px across stripes")] = 11
+    along: Annotated[int, Meta(ge=1, le=1001, description="m, camera px along stripes")] = 1
+    reduce: Annotated[int, Meta(ge=1, le=64, description="k, camera px averaged each way")] = 4
+    repeat: Annotated[Count, Meta(description="images, one after the other; live: many")] = 1
 
 
 class Measuring(Spec, frozen=True, kw_only=True):
@@ -159,6 +228,69 @@ class CalibrateLatency(Calibration, frozen=True, kw_only=True, tag="calibrate-la
     flashes: Annotated[int, Meta(ge=8, le=1000, description="flashes, their triggers spread")] = 48
 
 
-AnySeparation = Checkerboard | TwoImage | Stick
+class Point(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A point of interest in camera pixels; without a name it gets a letter."""
+
+    x: Annotated[float, Meta(ge=0)]
+    y: Annotated[float, Meta(ge=0)]
+    name: str = ""
+
+
+class Verification(Measuring, frozen=True, kw_only=True):
+    """An experiment of §3.5: the global component at points that are kept unlit."""
+
+    points: Annotated[
+        tuple[Point, ...],
+        Meta(max_length=26, description="a point of interest in camera pixels; several times"),
+    ] = ()
+    average: Annotated[
+        int, Meta(ge=2, le=1000, description="frames averaged a pattern (the paper: 32)")
+    ] = 16
+    leakage: Annotated[Leak, Meta(description=LEAKAGE)] | None = None  # None: as calibrated
+
+
+PatchSizes = Annotated[
+    tuple[Annotated[int, Meta(ge=1, le=256)], ...],
+    Meta(min_length=2, max_length=64, description="sides in projector px"),
+]
+
+
+class VerifyPatchSize(Verification, frozen=True, kw_only=True, tag="verify-patch-size"):
+    """Figure 4(b): the scene lit but for p x p patches at the points, p swept."""
+
+    sizes: PatchSizes = (3, 5, 7, 9, 11, 13, 15, 17, 19, 21)
+
+
+class VerifyRandomPatterns(Verification, frozen=True, kw_only=True, tag="verify-random-patterns"):
+    """Figure 4(c): many random half-lit patterns; mean and deviation of the global component."""
+
+    patterns: Annotated[int, Meta(ge=4, le=1000, description="how many")] = 100
+    patch: Patch = 6
+    seed: Seed = 1
+
+
+class VerifyLitFraction(Verification, frozen=True, kw_only=True, tag="verify-lit-fraction"):
+    """Figure 4(d): random patterns with a fraction α of their patches lit, α swept."""
+
+    fractions: Annotated[
+        tuple[Annotated[float, Meta(gt=0, lt=1)], ...],
+        Meta(min_length=3, max_length=64, description="lit fractions α"),
+    ] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+    draws: Annotated[int, Meta(ge=1, le=100, description="random patterns at each fraction")] = 4
+    patch: Patch = 6
+    seed: Seed = 1
+
+
+class VerifyCheckerSize(Verification, frozen=True, kw_only=True, tag="verify-checker-size"):
+    """Figure 4(e): checkers of q pixels, q swept, with the same patch at the points unlit."""
+
+    sizes: PatchSizes = (2, 3, 4, 6, 8, 12, 16, 20, 24, 32)
+    patch: Patch = 6
+
+
+AnySeparation = (
+    Checkerboard | TwoImage | Stick | Sinusoid | RandomPhase | GrayCode | RandomBinary | SingleImage
+)
 AnyCalibration = CalibrateDark | CalibrateNoise | CalibrateLeak | CalibrateTone | CalibrateLatency
-AnyScan = AnySeparation | AnyCalibration
+AnyVerification = VerifyPatchSize | VerifyRandomPatterns | VerifyLitFraction | VerifyCheckerSize
+AnyScan = AnySeparation | AnyCalibration | AnyVerification

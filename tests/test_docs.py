@@ -13,6 +13,9 @@ import pytest
 from typer.main import get_command
 
 from daemon import config
+from daemon.frames import FrameRecord
+from daemon.separation.estimator import Quality
+from daemon.store import RunFile
 from drivers import registry
 from protocol.cli.app import app
 
@@ -165,3 +168,21 @@ def test_each_key_of_each_driver_is_documented(kind: str, driver: str) -> None:
         assert {
             key for key in options if not re.search(rf"`{key}\b|^ *{key} = ", text, re.M)
         } == set()
+
+
+@pytest.mark.parametrize(
+    ("heading", "record"), [("run.json", RunFile), ("frames.jsonl", FrameRecord)]
+)
+def test_each_field_of_a_run_is_documented(heading: str, record: type[msgspec.Struct]) -> None:
+    text = (REPOSITORY / "docs/runs.md").read_text().split(f"## {heading}\n", 1)[1]
+    rows = re.findall(r"^\| (`.*?) \|", text.split("\n## ")[0], re.MULTILINE)
+    assert {key for row in rows for key in re.findall(r"`(\w+)`", row)} == keys(record)
+
+
+def test_each_quality_bit_is_documented() -> None:
+    text = (REPOSITORY / "docs/runs.md").read_text()
+    rows = {
+        (int(bit), bit_name)
+        for bit, bit_name in re.findall(r"^\| (\d+) \| ([\w ]+) \|", text, re.M)
+    }
+    assert rows == {(q.value, (q.name or "").lower().replace("_", " ")) for q in Quality}

@@ -10,9 +10,17 @@ from daemon.scans.calibrate_leak import LeakMethod
 from daemon.scans.calibrate_noise import NoiseMethod
 from daemon.scans.calibrate_tone import ToneMethod
 from daemon.scans.checkerboard import CheckerboardMethod
+from daemon.scans.gray_code import GrayCodeMethod
 from daemon.scans.method import Bench, Method, Unsuitable
+from daemon.scans.random_binary import RandomBinaryMethod
+from daemon.scans.single_image import SingleImageMethod
+from daemon.scans.sinusoid import RandomPhaseMethod, SinusoidMethod
 from daemon.scans.stick import StickMethod
 from daemon.scans.two_image import TwoImageMethod
+from daemon.scans.verify_checker_size import VerifyCheckerSizeMethod
+from daemon.scans.verify_lit_fraction import VerifyLitFractionMethod
+from daemon.scans.verify_patch_size import VerifyPatchSizeMethod
+from daemon.scans.verify_random_patterns import VerifyRandomPatternsMethod
 from protocol.scans import (
     AnyScan,
     CalibrateDark,
@@ -21,19 +29,37 @@ from protocol.scans import (
     CalibrateNoise,
     CalibrateTone,
     Checkerboard,
+    GrayCode,
+    RandomBinary,
+    RandomPhase,
+    SingleImage,
+    Sinusoid,
     Stick,
     TwoImage,
+    VerifyCheckerSize,
+    VerifyLitFraction,
+    VerifyPatchSize,
+    VerifyRandomPatterns,
 )
 
 _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     Checkerboard: CheckerboardMethod,
     TwoImage: TwoImageMethod,
     Stick: StickMethod,
+    Sinusoid: SinusoidMethod,
+    RandomPhase: RandomPhaseMethod,
+    GrayCode: GrayCodeMethod,
+    RandomBinary: RandomBinaryMethod,
+    SingleImage: SingleImageMethod,
     CalibrateDark: DarkMethod,
     CalibrateNoise: NoiseMethod,
     CalibrateLeak: LeakMethod,
     CalibrateTone: ToneMethod,
     CalibrateLatency: LatencyMethod,
+    VerifyPatchSize: VerifyPatchSizeMethod,
+    VerifyRandomPatterns: VerifyRandomPatternsMethod,
+    VerifyLitFraction: VerifyLitFractionMethod,
+    VerifyCheckerSize: VerifyCheckerSizeMethod,
 }
 
 NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())

@@ -8,14 +8,13 @@ import numpy as np
 
 from daemon import patterns
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import PatternMethod
+from daemon.scans.pattern_scan import RankedMethod
 from daemon.separation.estimator import Estimator
-from daemon.separation.extremes import MaxMin
 from protocol.patterns import Checker
 from protocol.scans import Checkerboard
 
 
-class CheckerboardMethod(PatternMethod[Checkerboard]):
+class CheckerboardMethod(RankedMethod[Checkerboard]):
     """A checkerboard shifted over a square of offsets, rows first; each pixel lit and unlit."""
 
     name: ClassVar[str] = "checkerboard"
@@ -38,12 +37,7 @@ class CheckerboardMethod(PatternMethod[Checkerboard]):
 
     def estimator(self) -> Estimator:
         """See `Method`."""
-        return MaxMin(
-            self.response,
-            lit_fraction=self.lit_fraction,
-            leakage=self.leakage,
-            average=self.spec.average,
-        )
+        return self.ranking()
 
 
 def _check_coverage(spec: Checkerboard) -> None:

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from typing import ClassVar, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from daemon import patterns
 from daemon.scans.method import Bench, Expose, Method, Step, Taken, Unsuitable
-from daemon.separation.estimator import Lighting, Observation
+from daemon.separation.estimator import Estimator, Lighting, Observation
+from daemon.separation.extremes import MaxMin
 from daemon.separation.radiometry import Response
+from daemon.separation.topk import KEEP, TopK
 from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.scans import PatternScan, Radiometry, Reference
+
+_PLACES, _MARGIN, _SAMPLES = 96, 8, 1500
 
 P = TypeVar("P", bound=PatternScan)
 
@@ -51,11 +59,20 @@ def leakage_of(radiometry: Radiometry, bench: Bench) -> float:
 class PatternMethod(Method[P]):
     """References first, then each pattern once, `average` frames each.
 
+    `estimators` are those that a method has; the first is what auto chooses.
+
     On a recording a reference is one image, and only those named in the spec are there.
     """
 
+    estimators: ClassVar[tuple[str, ...]] = ("maxmin",)
+
     def __init__(self, spec: P, bench: Bench, pattern_set: Sequence[AnyPattern]) -> None:
         super().__init__(spec, bench)
+        if spec.estimator not in {"auto", *self.estimators}:
+            raise Unsuitable(
+                f"{self.name} has no estimator {spec.estimator}: {', '.join(self.estimators)}",
+                "$.estimator",
+            )
         self.response = response_of(spec.radiometry, bench)
         self.leakage = leakage_of(spec.radiometry, bench)
         self._plan = (*self._references(), *self._exposures(pattern_set))
@@ -123,6 +140,20 @@ class PatternMethod(Method[P]):
         lit = [patterns.lit_fraction(p, projector.width, projector.height) for p in shown]
         return sum(lit) / len(lit)
 
+    def levels(self, blur: float) -> NDArray[np.float32]:
+        """Levels of the pattern set, 0 to 1, at places all over it under a projector's blur (px):
+        (patterns, places)."""
+        side = _PLACES + 2 * _MARGIN
+        rng = np.random.default_rng(0)
+        rows, columns = rng.integers(_MARGIN, side - _MARGIN, (2, _SAMPLES))
+        found = np.empty((len(self._patterns), _SAMPLES), dtype=np.float32)
+        for index, pattern in enumerate(self._patterns):
+            image = patterns.render(pattern, side, side).astype(np.float32) / patterns.LEVELS
+            if blur:
+                image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), dtype=np.float32)
+            found[index] = image[rows, columns]
+        return found
+
     def planned(self) -> int:
         """Frames of the whole plan."""
         return sum(step.frames for step in self._plan)
@@ -142,4 +173,35 @@ class PatternMethod(Method[P]):
             last=taken.sub == step.frames - 1,
             used=not taken.incomplete,
             reason="incomplete frame" if taken.incomplete else "",
+        )
+
+
+class RankedMethod(PatternMethod[P]):
+    """A set of two-valued patterns of one lit fraction, of which each pixel's brightest and darkest
+    samples tell direct from global."""
+
+    estimators = ("topk", "maxmin")
+
+    def ranking(self) -> Estimator:
+        """The paper's max/min where it is asked for, or where there are too few patterns to rank;
+        else topk."""
+        name = self.spec.estimator
+        if name == "topk" and len(self._patterns) < 2 * KEEP:
+            raise Unsuitable(
+                f"topk ranks {2 * KEEP} patterns at least; take maxmin for {len(self._patterns)}",
+                "$.estimator",
+            )
+        if name == "maxmin" or len(self._patterns) < 2 * KEEP:
+            return MaxMin(
+                self.response,
+                lit_fraction=self.lit_fraction,
+                leakage=self.leakage,
+                average=self.spec.average,
+            )
+        return TopK(
+            self.response,
+            lit_fraction=self.lit_fraction,
+            leakage=self.leakage,
+            levels=self.levels,
+            average=self.spec.average,
         )

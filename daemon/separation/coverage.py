@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
-from daemon.separation.finish import bits, finish
+from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.noise import TemporalNoise, noise_range
 from daemon.separation.order import Ranked
 from daemon.separation.radiometry import Plane, Response
@@ -119,11 +119,10 @@ class Occluder:
             indirect,
             response=self._response,
             brightest=high[0],
-            deviation=deviation,
             saturated=self._high.planes[0] >= self._response.saturated_from,
             flags=bits(never, Quality.NEVER_UNLIT) | bits(single, Quality.SINGLE),
             planes={"coverage": coverage},
-            samples=frames,
+            judgement=Judgement.of_extremes(deviation, frames),
             facts={
                 "estimator": "maxmin",
                 "frames": frames,

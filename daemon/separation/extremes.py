@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import finish
+from daemon.separation.finish import Judgement, finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
@@ -109,9 +109,8 @@ class MaxMin:
             indirect,
             response=self._response,
             brightest=brightest,
-            deviation=self._noise.deviation(brightest),
             saturated=saturated,
-            samples=self._patterns,
+            judgement=Judgement.of_extremes(self._noise.deviation(brightest), self._patterns),
             facts={
                 "estimator": "maxmin",
                 "patterns": self._patterns,

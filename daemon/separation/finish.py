@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,30 @@ from daemon.separation.estimator import Components, Quality
 from daemon.separation.noise import noise_range
 from daemon.separation.radiometry import Plane, Response
 
+SIGNIFICANT = 3.0
+"""How many standard deviations tell a component from noise."""
+
+DEVIATIONS = frozenset({"direct_std", "global_std"})
+"""Planes that have a component's shape."""
+
 _BINS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What noise alone can make of a sample's components, as limits (float32, a frame's shape):
+    direct below `direct` and total below `total` are not told from none; `deviation` is that of one
+    frame's light."""
+
+    direct: Plane
+    total: Plane
+    deviation: Plane
+
+    @classmethod
+    def of_extremes(cls, deviation: Plane, samples: int) -> Judgement:
+        """For the largest and smallest of so many samples."""
+        limit = np.float32(noise_range(samples)) * deviation
+        return cls(limit, limit, deviation)
 
 
 def finish(
@@ -21,21 +45,20 @@ def finish(
     *,
     response: Response,
     brightest: Plane,
-    deviation: Plane,
     saturated: NDArray[np.bool_],
-    samples: int,
+    judgement: Judgement,
     facts: dict[str, Any],
     flags: NDArray[np.uint16] | None = None,
     planes: dict[str, NDArray[Any]] | None = None,
 ) -> Components:
     """Judge the samples' components, then make colours of a mosaic.
 
-    `direct`, `indirect`, `brightest` (linear light, ambient included), its standard `deviation` and
-    `saturated` have the shape of a frame; `samples` were compared for each extreme;
-    `flags` (H, W) are the method's own bits, of which NEVER_LIT and NEVER_UNLIT make both
-    components NaN.
+    `direct`, `indirect`, `brightest` (linear light, ambient included) and `saturated` have the
+    shape of a frame; `flags` (H, W) are the method's own bits, of which NEVER_LIT and NEVER_UNLIT
+    make both components NaN. Of `planes`, deviations have a frame's shape and get colours too.
     """
-    quality = judge(direct, indirect, saturated, deviation, noise_range(samples))
+    planes = dict(planes or {})
+    quality = judge(direct, indirect, saturated, judgement)
     if flags is not None:
         quality |= flags
     unknown = quality & np.uint16(Quality.NEVER_LIT | Quality.NEVER_UNLIT) != 0
@@ -46,11 +69,13 @@ def finish(
         # A colour is interpolated from its neighbours: what is wrong with them is wrong with it.
         quality = spread(quality, Quality.SATURATED)
         direct, indirect = (mosaic.demosaic(x, response.bayer) for x in (direct, indirect))
+        for name in DEVIATIONS & planes.keys():
+            planes[name] = mosaic.demosaic(planes[name], response.bayer)
         direct[unknown] = np.nan
         indirect[unknown] = np.nan
     figures = {
         **facts,
-        "noise_counts": round(float(np.nanmedian(deviation)), 4),
+        "noise_counts": round(float(np.nanmedian(judgement.deviation)), 4),
         "black_level": response.black,
         "tone": response.tone,
         "full_scale": response.full_scale,
@@ -58,27 +83,21 @@ def finish(
         "quality": count(quality),
         "exposure_histogram": histogram(brightest, response.linear_full_scale),
     }
-    return Components(direct, indirect, quality, dict(planes or {}), figures)
+    return Components(direct, indirect, quality, planes, figures)
 
 
 def judge(
-    direct: Plane,
-    indirect: Plane,
-    saturated: NDArray[np.bool_],
-    deviation: Plane,
-    spread_of_noise: float,
+    direct: Plane, indirect: Plane, saturated: NDArray[np.bool_], judgement: Judgement
 ) -> NDArray[np.uint16]:
     """Quality bits of each pixel (H, W) uint16 that follow from values and noise alone.
 
     A pixel is dark or of low modulation when each of its channels is; saturated or negative when
-    one of them is. `spread_of_noise` is how far apart noise alone drives the extremes, in
-    deviations.
+    one of them is.
     """
-    limit = np.float32(spread_of_noise) * deviation
     with np.errstate(invalid="ignore"):
-        dark = _every(direct + indirect < limit)
-        flat = _every(direct < limit)
-        negative = _some((direct < -limit) | (indirect < -2 * limit))
+        dark = _every(direct + indirect < judgement.total)
+        flat = _every(direct < judgement.direct)
+        negative = _some((direct < -judgement.direct) | (indirect < -2 * judgement.total))
     quality = bits(_some(saturated), Quality.SATURATED)
     quality |= bits(dark, Quality.DARK)
     quality |= bits(flat, Quality.LOW_MODULATION)

@@ -27,6 +27,7 @@ _ENOUGH = 200  # differences that make a level's deviation
 _SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 _SECOND_DIFFERENCE_NORM = 6.0  # what it makes of independent samples of deviation 1
 _BLOCK = 16
+_BLOCKS = 12  # blocks that make a level's deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,24 +106,32 @@ def noise_range(samples: int) -> float:
 
 
 def from_picture(counts: Plane, full_scale: int, step: int = 1) -> Noise:
-    """Noise of a single picture (H, W): what a second difference leaves where the scene is smooth.
+    """Noise of a single picture (H, W) by level: what a second difference leaves where the scene is
+    smooth.
 
-    Textured blocks say too much, so that the quietest fifth of the blocks speaks: an upper bound
-    in a scene that is textured everywhere. `step` is the distance of samples of one colour (2 in a
-    mosaic). Never less than the rounding of counts.
+    Textured blocks say too much, so that at each level the quietest fifth of the blocks speaks: an
+    upper bound in a scene that is textured everywhere. `step` is the distance of samples of one
+    colour (2 in a mosaic). Never less than the rounding of counts.
     """
     plane = np.ascontiguousarray(counts[::step, ::step])
-    deviation = _ROUNDING
-    if min(plane.shape) >= _BLOCK:
-        second = np.abs(cv2.filter2D(plane, -1, _SECOND_DIFFERENCE, borderType=cv2.BORDER_REFLECT))
-        height, width = (n // _BLOCK for n in second.shape)
-        tiles = second[: height * _BLOCK, : width * _BLOCK].reshape(height, _BLOCK, width, _BLOCK)
-        spread = np.median(tiles.transpose(0, 2, 1, 3).reshape(height * width, -1), axis=1)
-        spread = spread[np.isfinite(spread)]
-        if spread.size:
-            quiet = float(np.quantile(spread, 0.2)) * _MAD / _SECOND_DIFFERENCE_NORM
-            deviation = max(quiet, _ROUNDING)
-    return Noise((0.0, float(full_scale)), (float(deviation), float(deviation)))
+    height, width = (n // _BLOCK for n in plane.shape)
+    if height * width == 0:
+        return Noise((0.0, float(full_scale)), (_ROUNDING, _ROUNDING))
+    second = np.abs(cv2.filter2D(plane, -1, _SECOND_DIFFERENCE, borderType=cv2.BORDER_REFLECT))
+
+    def by_block(values: Plane) -> Plane:
+        tiles = values[: height * _BLOCK, : width * _BLOCK]
+        tiles = tiles.reshape(height, _BLOCK, width, _BLOCK).transpose(0, 2, 1, 3)
+        return np.asarray(np.median(tiles.reshape(height * width, -1), axis=1))
+
+    spread, level = by_block(np.asarray(second, dtype=np.float32)), by_block(plane)
+    order = np.argsort(level, kind="stable")
+    levels, deviations = [], []
+    for group in np.array_split(order, min(max(order.size // _BLOCKS, 1), 8)):
+        quiet = float(np.quantile(spread[group], 0.2)) * _MAD / _SECOND_DIFFERENCE_NORM
+        levels.append(float(np.mean(level[group])))
+        deviations.append(max(quiet, _ROUNDING))
+    return Noise(tuple(levels), tuple(deviations))
 
 
 def from_frame(counts: NDArray[Any], full_scale: int, bayer: str) -> Noise:
@@ -130,4 +139,4 @@ def from_frame(counts: NDArray[Any], full_scale: int, bayer: str) -> Noise:
     if counts.ndim == 2:
         return from_picture(counts.astype(np.float32), full_scale, step=2 if bayer else 1)
     channels = (from_picture(c.astype(np.float32), full_scale) for c in np.moveaxis(counts, 2, 0))
-    return max(channels, key=lambda one: one.deviations[0])
+    return max(channels, key=lambda one: one.typical)

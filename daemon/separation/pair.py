@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import finish
+from daemon.separation.finish import Judgement, finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
+
+_RESIDUAL = 0.02
+"""Part of the light by which a pattern and its complement may miss black and white together."""
 
 
 class ComplementPair:
@@ -65,9 +68,8 @@ class ComplementPair:
             indirect,
             response=self._response,
             brightest=brightest,
-            deviation=self._noise.deviation(brightest),
             saturated=self._saturated,
-            samples=2,
+            judgement=Judgement.of_extremes(self._noise.deviation(brightest), 2),
             facts={
                 "estimator": "complement pair",
                 "patterns": 2,
@@ -94,7 +96,7 @@ class ComplementPair:
         ambient: Plane = black - whole * np.float32(b / (1.0 - b))
         return ambient, "black frame and the pair"
 
-    def _residual(self, first: Plane, second: Plane) -> dict[str, float]:
+    def _residual(self, first: Plane, second: Plane) -> dict[str, Any]:
         """Median of (P + I - W - K)/(W + K): not 0 for a wrong tone curve."""
         black = self._references.mean(Lighting.BLACK)
         white = self._references.mean(Lighting.WHITE)
@@ -103,7 +105,17 @@ class ComplementPair:
         whole = white + black
         bright = whole > 0.1 * float(np.max(whole))
         residual = (first + second - whole)[bright] / whole[bright]
-        return {"complement_residual": round(float(np.median(residual)), 5)}
+        found = round(float(np.median(residual)), 5)
+        return {
+            "complement_residual": found,
+            "advice": [
+                f"the two images together have {found:+.1%} of the light of black and white "
+                "together: the camera's tone curve is not the one given, or the source changed; "
+                "give the curve with --tone"
+            ]
+            if abs(found) > _RESIDUAL
+            else [],
+        }
 
     def summary(self) -> dict[str, float]:
         """Frames of both images, and those not used."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,17 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.estimator import Lighting
 from daemon.separation.radiometry import FrameMean, Plane, Response
+
+
+@dataclass(frozen=True, slots=True)
+class Total:
+    """L_d + L_g, and what the variance of light under half of the source and of one frame makes of
+    its variance, as factors."""
+
+    light: Plane
+    of_half: float
+    of_frame: float
+    source: str
 
 
 class References:
@@ -35,28 +48,75 @@ class References:
         mean = self._means.get(lighting)
         return mean.value() if mean else None
 
+    def frames(self, lighting: Lighting) -> int:
+        """How many frames of a kind came."""
+        mean = self._means.get(lighting)
+        return mean.frames if mean else 0
+
+    def total(self, half: Plane, leakage: float) -> Total:
+        """L_d + L_g from light under half of the source, A + ½(1 + b)(L_d + L_g), and references.
+
+        With a black and a white frame (W - K)/(1 - b): half the light lies in the middle of the two
+        and cannot better their slope. Where white is saturated or missing 2(half - K)/(1 - b); with
+        a source-off frame 2(half - A)/(1 + b); with none ambient light is taken for none.
+        """
+        off, black = self.mean(Lighting.AMBIENT), self.mean(Lighting.BLACK)
+        if off is not None:
+            weight = 2.0 / (1.0 + leakage)
+            share = weight**2 / self.frames(Lighting.AMBIENT)
+            return Total((half - off) * np.float32(weight), weight**2, share, "ambient frame")
+        if black is None:
+            weight = 2.0 / (1.0 + leakage)
+            return Total(half * np.float32(weight), weight**2, 0.0, "none")
+        weight = 2.0 / (1.0 - leakage)
+        total: Plane = (half - black) * np.float32(weight)
+        share = weight**2 / self.frames(Lighting.BLACK)
+        white = self.mean(Lighting.WHITE)
+        if white is None or self._white_saturated is None:
+            return Total(total, weight**2, share, "black frame")
+        whole: Plane = (white - black) * np.float32(1.0 / (1.0 - leakage))
+        if self._white_saturated.any():
+            total = np.where(self._white_saturated, total, whole)
+            return Total(total, weight**2, share, "black and white frames")
+        frames = 1.0 / self.frames(Lighting.BLACK) + 1.0 / self.frames(Lighting.WHITE)
+        share = frames / (1.0 - leakage) ** 2
+        return Total(whole, 0.0, share, "black and white frames")
+
+    def share(self, source: str) -> float:
+        """The variance of `ambient` for one frame's, to first order in the leakage."""
+        kind = Lighting.AMBIENT if source == "ambient frame" else Lighting.BLACK
+        return 1.0 / max(self.frames(kind), 1)
+
     def facts(self, ambient_from: str) -> dict[str, Any]:
         """Which reference frames there were and what ambient light was taken from."""
         frames = {kind.value: mean.frames for kind, mean in self._means.items()}
         return {"ambient_from": ambient_from, "reference_frames": frames}
 
     def ambient(
-        self, brightest: Plane, darkest: Plane, lit_fraction: float, leakage: float
+        self,
+        brightest: Plane,
+        darkest: Plane,
+        lit_fraction: float,
+        leakage: float,
+        reduced: Callable[[Plane], Plane] = lambda plane: plane,
     ) -> tuple[Plane | None, str]:
         """Light that is not the source's, and from what it is known; None where nothing tells.
 
         A source-off frame says it outright. A black frame holds its leakage as well, which a white
-        frame (where it is not saturated) or the extremes take out.
+        frame (where it is not saturated) or the extremes take out. `reduced` makes a frame's plane
+        one of the extremes' size.
         """
         off = self.mean(Lighting.AMBIENT)
         if off is not None:
-            return off, "ambient frame"
+            return reduced(off), "ambient frame"
         black = self.mean(Lighting.BLACK)
         if black is None:
             return None, "none"
+        black = reduced(black)
         ambient = light_model.ambient_from_black(black, brightest, darkest, lit_fraction, leakage)
         white = self.mean(Lighting.WHITE)
         if white is None or self._white_saturated is None or leakage == 0.0:
             return ambient, "black frame"
-        measured = light_model.ambient_from_black_and_white(black, white, leakage)
-        return np.where(self._white_saturated, ambient, measured), "black and white frames"
+        saturated = reduced(self._white_saturated.astype(np.float32)) > 0
+        measured = light_model.ambient_from_black_and_white(black, reduced(white), leakage)
+        return np.where(saturated, ambient, measured), "black and white frames"

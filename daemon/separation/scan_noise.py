@@ -16,6 +16,8 @@ from daemon.separation.noise import Noise, TemporalNoise, from_frame
 from daemon.separation.radiometry import Plane, Response
 
 _SAMPLE = 4
+_ENOUGH = 100  # samples that make a level's deviation
+_LEVELS = 24
 
 
 class ScanNoise:
@@ -40,12 +42,113 @@ class ScanNoise:
         self._last = pattern, sample
 
     @property
+    def measured(self) -> bool:
+        """Whether it is measured, not an upper bound."""
+        return self._repeats.pairs > 0
+
+    @property
     def source(self) -> str:
         """From what the noise is known."""
-        return "repeated frames" if self._repeats.pairs else "one picture"
+        return "repeated frames" if self.measured else "one picture"
 
     def deviation(self, light: Plane) -> Plane:
         """Standard deviation of a pattern's averaged linear light at a level of it (float32)."""
         noise = self._repeats.noise() or self._picture
         one = self._response.deviation(noise, self._response.counts(light))
         return one * np.float32(self._average**-0.5)
+
+
+class ResidualNoise:
+    """Noise from what a fit of M + B sin(φ + δ) leaves, on every fourth row and column.
+
+    With three phases a fit leaves nothing: repeats of a phase tell it then, or the first picture.
+    """
+
+    def __init__(self, response: Response) -> None:
+        self._response = response
+        self._frequencies: dict[int, _Residuals] = {}
+        self._picture: Noise | None = None
+
+    def add(self, pixels: NDArray[Any], light: Plane, frequency: int, delta: float) -> None:
+        """Take in a frame (counts and their linear light) of a phase."""
+        if self._picture is None:
+            self._picture = from_frame(pixels, self._response.full_scale, self._response.bayer)
+        residuals = self._frequencies.setdefault(frequency, _Residuals())
+        residuals.add(light[::_SAMPLE, ::_SAMPLE], delta)
+
+    @property
+    def source(self) -> str:
+        """From what the noise is known."""
+        return "residuals of the fit" if self.measured else "one picture"
+
+    @property
+    def measured(self) -> bool:
+        """Whether it is measured, not an upper bound."""
+        return self._fitted() is not None
+
+    def noise(self) -> Noise | None:
+        """Deviation of one frame's counts by level."""
+        return self._fitted() or self._picture
+
+    def _fitted(self) -> Noise | None:
+        found = [r.variance() for r in self._frequencies.values() if r.freedom > 0]
+        if not found:
+            return None
+        light = np.concatenate([level.reshape(-1) for level, _ in found])
+        variance = np.concatenate([v.reshape(-1) for _, v in found])
+        freedom = min(r.freedom for r in self._frequencies.values() if r.freedom > 0)
+        return by_level(self._response, light, variance, freedom)
+
+
+def by_level(response: Response, light: Plane, variance: Plane, freedom: int) -> Noise | None:
+    """Noise of encoded counts from samples of the variance of linear light, by level.
+
+    The median of each level is taken, for what is not noise (blur, motion) is in the minority;
+    a χ² distribution's median is below its mean by (1 - 2/9f)³.
+    """
+    counts = response.counts(light)
+    slope = response.deviation(None, counts) * np.float32(12.0**0.5)
+    groups = np.array_split(np.argsort(counts, kind="stable"), min(counts.size // _ENOUGH, _LEVELS))
+    levels, deviations = [], []
+    for group in groups if counts.size >= _ENOUGH else ():
+        median = float(np.median(variance[group])) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
+        encoded = np.sqrt(median) / max(float(np.median(slope[group])), 1e-9)
+        levels.append(float(np.mean(counts[group], dtype=np.float64)))
+        deviations.append(float(max(encoded, 12.0**-0.5)))
+    return Noise(tuple(levels), tuple(deviations)) if levels else None
+
+
+class _Residuals:
+    """Sums of one frequency on the sampled pixels, in float64: small differences of squares."""
+
+    def __init__(self) -> None:
+        self._sums: NDArray[np.float64] | None = None
+        self._squares: NDArray[np.float64] | None = None
+        self._normal = np.zeros((3, 3))
+        self._frames = 0
+
+    def add(self, light: Plane, delta: float) -> None:
+        values = light.astype(np.float64)
+        if self._sums is None or self._squares is None:
+            self._sums = np.zeros((3, *values.shape))
+            self._squares = np.zeros(values.shape)
+        row = np.array([1.0, np.cos(delta), np.sin(delta)])
+        self._sums += row.reshape(3, *[1] * values.ndim) * values
+        self._squares += values * values
+        self._normal += np.outer(row, row)
+        self._frames += 1
+
+    @property
+    def freedom(self) -> int:
+        """Frames beyond the three that a fit takes."""
+        singular = np.linalg.matrix_rank(self._normal, tol=1e-6) < 3
+        return 0 if singular else self._frames - 3
+
+    def variance(self) -> tuple[Plane, Plane]:
+        """The mean level and the variance of one frame around the fit, of each sampled pixel."""
+        assert self._sums is not None
+        assert self._squares is not None
+        fitted = np.tensordot(np.linalg.inv(self._normal), self._sums, axes=1)
+        left = self._squares - np.einsum("k...,k...->...", fitted, self._sums)
+        variance = np.maximum(left, 0.0) / self.freedom
+        return fitted[0].astype(np.float32), variance.astype(np.float32)

@@ -8,7 +8,7 @@ holds is a matter of clock times alone, however late a thread runs and however f
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -49,6 +49,37 @@ class Source(Protocol):
         ...
 
 
+class TriggerLine:
+    """A wire from a projector's trigger output to the cameras of the bench.
+
+    Pulses are noted before their moment comes, as changes of light are. Use it under the bench's
+    lock.
+    """
+
+    def __init__(self) -> None:
+        self._pulses: deque[int] = deque(maxlen=4096)
+        self.listeners: set[threading.Event] = set()  # set whenever the pulses change
+
+    def fire(self, moments: Sequence[int]) -> None:
+        """Plan pulses, in order, later than all before."""
+        self._pulses.extend(moments)
+        self._tell()
+
+    def cut(self, at_ns: int) -> None:
+        """What was planned for then or later does not happen."""
+        while self._pulses and self._pulses[-1] >= at_ns:
+            self._pulses.pop()
+        self._tell()
+
+    def after(self, at_ns: int) -> int | None:
+        """The first pulse later than a moment, as planned now."""
+        return next((pulse for pulse in self._pulses if pulse > at_ns), None)
+
+    def _tell(self) -> None:
+        for event in self.listeners:
+            event.set()
+
+
 class Carrier(Protocol):
     """What moves an occluder through the light."""
 
@@ -68,6 +99,7 @@ class Bench:
         self.lock = threading.RLock()
         self.sources: dict[str, Source] = {}
         self.carrier: Carrier | None = None
+        self.line: TriggerLine | None = None  # there is one where a projector sends pulses
         self._planes: OrderedDict[Hashable, F32] = OrderedDict()
 
     @classmethod
@@ -130,6 +162,11 @@ class Bench:
                 direct[k] += parts[0]
                 others[k] += parts[1]
         return direct, others
+
+    def prepare(self, width: int, height: int) -> None:
+        """Build the main sources' light transport to a view of a size: a second, once."""
+        for name in self.main_sources():
+            transport(width, height, self.sources[name].pinhole)
 
     def main_sources(self) -> tuple[str, ...]:
         """The projector, or without one all lights."""

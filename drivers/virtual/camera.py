@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -21,6 +22,7 @@ from drivers.base import (
     DeviceRefused,
     DeviceTimeout,
     Frame,
+    Identity,
     Options,
     PixelFormat,
 )
@@ -71,11 +73,12 @@ class VirtualCamera(VirtualDevice, Camera):
     """A camera with a global shutter that integrates the light of the bench, frame by frame.
 
     Software-triggered: an exposure begins `trigger_latency_us` after its trigger, or when the
-    sensor is free. Free-running: at `frame_rate_hz`, into `buffers` buffers; a frame that finds
-    none free is lost, and its sequence number with it. Pixels are black level + electrons x gain,
-    with shot noise (its variance the electrons themselves) and read noise from a generator seeded
-    with `seed` and the number of the frame since the camera was made. A frame whose light the
-    bench has forgotten (256 changes since) is `incomplete`. Gain in dB.
+    sensor is free. Hardware-triggered: the same after each pulse on the bench's line, but a pulse
+    that finds the sensor exposing is not heard. Free-running: at `frame_rate_hz`. A frame that
+    finds none of the `buffers` free is lost, and its sequence number with it. Pixels are black
+    level + electrons x gain, with shot noise (its variance the electrons themselves) and read noise
+    from a generator seeded with `seed` and the number of the frame since the camera was made. A
+    frame whose light the bench has forgotten is `incomplete`. Gain in dB.
 
     `configure`, `start`, `stop`, `safe` and `check` are safe to send again; `trigger` is not.
     """
@@ -96,6 +99,8 @@ class VirtualCamera(VirtualDevice, Camera):
         )
         self._acquisition: Acquisition | None = None
         self._waiting: deque[_Exposure] = deque()  # exposed or being exposed, not yet grabbed
+        self._heard = 0  # the last pulse on the trigger line that was looked at
+        self._wake = threading.Event()  # the pulses have changed, or it was halted
         self._free = 0  # when the sensor can begin to expose
         self._started = 0
         self._next = 0  # sequence number
@@ -137,6 +142,14 @@ class VirtualCamera(VirtualDevice, Camera):
             return round(max(fastest, NS / self._set.frame_rate_hz))
         return round(fastest)
 
+    def connect(self) -> Identity:
+        """See Device. The scene is built here, where no frame's deadline waits for it."""
+        identity = super().connect()
+        self.bench.prepare(self._o.width, self._o.height)
+        for layout in self._layouts():
+            _room(self._o.width, self._o.height, layout)
+        return identity
+
     def info(self) -> CameraInfo:
         """See Camera."""
         fastest = max(self._exposure_us * 1e3, self._o.readout_ms * 1e6)
@@ -148,7 +161,7 @@ class VirtualCamera(VirtualDevice, Camera):
             exposure_range_us=EXPOSURE_US,
             max_rate_hz=NS / fastest,
             readout_s=self._o.readout_ms / 1e3,
-            triggers=("software",),
+            triggers=("software", "hardware") if self.bench.line else ("software",),
         )
 
     def facts(self) -> dict[str, Any]:
@@ -201,12 +214,20 @@ class VirtualCamera(VirtualDevice, Camera):
     def start(self, acquisition: Acquisition, at: int = 0) -> None:  # noqa: ARG002
         """See Camera."""
         self._begin("start")
+        line = self.bench.line
         if acquisition is Acquisition.HARDWARE:
-            raise self._refuse("start", "it has no trigger line", "use software triggers")
+            if line is None:
+                raise self._refuse(
+                    "start",
+                    "nothing on the bench sends it triggers",
+                    "use software triggers, or add a virtual projector",
+                )
+            with self.bench.lock:
+                line.listeners.add(self._wake)
         self._waiting.clear()
         self._acquisition = acquisition
         self._next = 0
-        self._started = self._free = self.clock.now_ns()
+        self._started = self._free = self._heard = self.clock.now_ns()
 
     def trigger(self) -> tuple[int, int]:
         """See Camera. A trigger that comes before the sensor is free waits for it."""
@@ -225,6 +246,40 @@ class VirtualCamera(VirtualDevice, Camera):
         if len(self._waiting) < self._o.buffers:
             self._waiting.append(_Exposure(self._next, start, end))
         self._next += 1  # without a free buffer the frame is lost, its number used up
+
+    def halt(self) -> None:
+        """See Device."""
+        super().halt()
+        self._wake.set()
+
+    def _await_pulse(self, deadline_ns: int) -> None:
+        """Wait until a pulse has begun an exposure, for a halt, or for the deadline."""
+        while not self._waiting:
+            self._wake.clear()
+            if self._halted.is_set():
+                return
+            planned = self._listen()
+            if self._waiting or self.clock.now_ns() >= deadline_ns:
+                return
+            until = deadline_ns if planned is None else min(planned, deadline_ns)
+            self.clock.wait_until(until, self._wake)
+
+    def _listen(self) -> int | None:
+        """Expose for each pulse up to now; gives the next one that is planned."""
+        line = self.bench.line
+        assert line is not None
+        with self.bench.lock:
+            now = self.clock.now_ns()
+            while (pulse := line.after(self._heard)) is not None and pulse <= now:
+                self._heard = pulse
+                start = pulse + round(self._o.trigger_latency_us * 1e3)
+                missed = Fault.DROP_TRIGGER in self.faults.strike("trigger", self._halted)
+                if missed or start < self._free:
+                    continue
+                end = start + round(self._exposure_us * 1e3)
+                self._free = start + self._period_ns
+                self._queue(start, end)
+            return pulse
 
     def _run(self) -> None:
         """Expose all that a free-running camera has exposed by now, and the one in the making;
@@ -252,6 +307,8 @@ class VirtualCamera(VirtualDevice, Camera):
         deadline = self.clock.now_ns() + round(timeout_s * NS)
         if self._acquisition is Acquisition.FREE:
             self._run()
+        elif self._acquisition is Acquisition.HARDWARE:
+            self._await_pulse(deadline)
         if not self._waiting:
             halted = self.clock.wait_until(deadline, self._halted)
             raise self._late(halted, timeout_s, "was it triggered?")
@@ -302,6 +359,9 @@ class VirtualCamera(VirtualDevice, Camera):
         self._acquisition = None
         self._waiting.clear()
         self._last = None
+        if self.bench.line is not None:
+            with self.bench.lock:
+                self.bench.line.listeners.discard(self._wake)
 
     # ------------------------------------------------------------ light to counts
 

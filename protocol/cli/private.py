@@ -36,14 +36,8 @@ def private_daemon(config: Mapping[str, Any]) -> Iterator[Client]:
     """
     folder = _private_folder()
     try:
-        command = f"ipc://{folder}/command"
-        whole = {
-            "rig": {"name": "private", "data": str(folder / "data")},
-            "network": {"command": command, "events": f"ipc://{folder}/events"},
-            **config,
-        }
         file = folder / "rig.toml"
-        file.write_text(toml(whole), encoding="utf-8")
+        file.write_text(toml(configured(config, folder)), encoding="utf-8")
         with (folder / "log").open("wb") as log:
             process = subprocess.Popen(
                 # -P: a file in the user's folder must not pass for one of the daemon's modules
@@ -55,12 +49,24 @@ def private_daemon(config: Mapping[str, Any]) -> Iterator[Client]:
                 start_new_session=True,  # Ctrl-C is for us: we stop it in good order
             )
         try:
-            with _ends_in_order(), _when_ready(process, command, folder / "log") as client:
+            with (
+                _ends_in_order(),
+                _when_ready(process, f"ipc://{folder}/command", folder / "log") as client,
+            ):
                 yield client
         finally:
             _stop(process)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def configured(config: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A whole rig.toml: these tables, and everything that is written kept within the folder."""
+    return {
+        **config,
+        "rig": {**config.get("rig", {}), "name": "private", "data": f"{folder}/data"},
+        "network": {"command": f"ipc://{folder}/command", "events": f"ipc://{folder}/events"},
+    }
 
 
 @contextmanager

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import sys
+import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
 from protocol.cli.delivery import Delivery
 from protocol.cli.family import Family
 from protocol.cli.link import Json, Keys, Rig, connect
+from protocol.cli.options import with_options
 from protocol.cli.output import print_json, say
 from protocol.cli.runs import Force, fetch, wanted
 from protocol.cli.watch import conclude, follow, goes_on
 from protocol.cli.words import Fetched
+from protocol.errors import Code, UmbraError
 from protocol.messages import Run
-from protocol.scans import AnyCalibration, AnyScan, AnySeparation
+from protocol.scans import AnyCalibration, AnyScan, AnySeparation, AnyVerification
 
 
 def scan(
@@ -86,20 +92,65 @@ class Calibrations(Family):
     prefix = "calibrate-"
 
 
-app = typer.Typer(cls=Methods, rich_markup_mode=None, add_completion=False)
+class Verifications(Family):
+    """One command an experiment of §3.5."""
+
+    union = AnyVerification
+    act = scan
+    title = "Experiments"
+    prefix = "verify-"
 
 
-@app.callback(invoke_without_command=True)
-def _scan(context: typer.Context, rig: Rig = None, keys: Keys = None) -> None:
+def spec_in(file: Path) -> AnyScan:
+    """The spec in a TOML or JSON file: `method` and its fields. Raises UmbraError(bad_request)."""
+    try:
+        text = file.read_text(encoding="utf-8")
+        table = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
+        spec: AnyScan = msgspec.convert(table, type=AnyScan)
+    except OSError as error:
+        raise UmbraError(Code.BAD_REQUEST, f"{file}: {error.strerror}", "--file") from error
+    except ValueError as error:  # of either format, of the encoding, or msgspec's own
+        message = str(error).replace("`", "").replace("Object contains", "there is an")
+        raise UmbraError(Code.BAD_REQUEST, f"{file}: {message}", "--file") from error
+    return spec
+
+
+def _scan(
+    context: typer.Context,
+    file: Annotated[
+        Path | None,
+        typer.Option("--file", metavar="FILE", help="The scan, as TOML or JSON, for no METHOD."),
+    ] = None,
+    **given: Any,
+) -> int | None:
     """Queue a scan; prints the run's id. --wait follows it, -o DIR fetches what it made.
 
     Each method has its own options: umbra scan METHOD --help.
 
     --json: a Run; with -o {"run": RunInfo, "files": [path, ...]}.
     """
-    context.obj = {"rig": rig, "keys": keys}
-    if context.invoked_subcommand is None:
+    context.obj = {"rig": given["rig"], "keys": given["keys"]}
+    method = context.invoked_subcommand
+    misplaced = [n for n, value in given.items() if value and n not in {"rig", "keys"}]
+    if method is not None and (file or misplaced):
+        flag = "--file" if file else "--" + misplaced[0].removeprefix("as_")
+        raise UmbraError(
+            Code.BAD_REQUEST,
+            f"{flag} and {method}: give one or the other"
+            if file
+            else f"{flag} belongs after the method: umbra scan {method} {flag} ...",
+        )
+    if file is not None:
+        return scan(spec_in(file), **given)
+    if method is None:
         typer.echo(context.get_help())
+    return None
+
+
+app = typer.Typer(cls=Methods, rich_markup_mode=None, add_completion=False)
+app.callback(invoke_without_command=True)(
+    with_options(_scan, list(inspect.signature(scan, eval_str=True).parameters.values())[1:])
+)
 
 
 calibrate = typer.Typer(cls=Calibrations, rich_markup_mode=None, add_completion=False)
@@ -119,4 +170,18 @@ def _calibrate(context: typer.Context, rig: Rig = None, keys: Keys = None) -> No
         typer.echo(context.get_help())
 
 
-__all__: list[Any] = ["app", "calibrate", "scan"]
+verify = typer.Typer(cls=Verifications, rich_markup_mode=None, add_completion=False)
+
+
+@verify.callback(invoke_without_command=True)
+def _verify(context: typer.Context, rig: Rig = None, keys: Keys = None) -> None:
+    """Queue a verification experiment of the paper (3.5); prints the run's id.
+
+    Points of interest are camera pixels: --point 320,240 or --point wall=320,240, several times.
+    --wait and -o DIR as in `umbra scan`.
+
+    --json: a Run; with -o {"run": RunInfo, "files": [path, ...]}.
+    """
+    context.obj = {"rig": rig, "keys": keys}
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())

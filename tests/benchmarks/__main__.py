@@ -18,7 +18,7 @@ import msgspec
 
 from tests.benchmarks.ratio import Ratio
 
-NAMES = ("separation", "pace", "latency", "memory", "startup")
+NAMES = ("separation", "accuracy", "pace", "latency", "memory", "startup", "safety")
 MARKS = {True: "kept", False: "NOT KEPT", None: ""}
 
 

@@ -58,6 +58,8 @@ def test_a_wrong_tone_curve_shows_in_the_residual() -> None:
         pair = ComplementPair(Response(full_scale=65535, tone=tone), lit_fraction=0.5, leakage=0.02)
         for observation, light in shown:
             pair.update(np.rint(light ** (1 / 2.2) * 65535).astype(np.uint16), observation)
-        found[tone] = pair.result().facts["complement_residual"]
-    assert abs(found["gamma:2.2"]) < 0.001
-    assert abs(found["linear"]) > 0.05
+        found[tone] = pair.result().facts
+    assert abs(found["gamma:2.2"]["complement_residual"]) < 0.001
+    assert found["gamma:2.2"]["advice"] == []
+    assert abs(found["linear"]["complement_residual"]) > 0.05
+    assert "tone" in found["linear"]["advice"][0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -157,4 +157,5 @@ def test_a_stick_that_cannot_be(spec: Stick, bench: Bench, said: str) -> None:
 
 
 def test_names() -> None:
-    assert {"checkerboard", "two-image", "stick", "calibrate-leak"} <= set(catalog.NAMES)
+    tags = {kind.__struct_config__.tag for kind in get_args(AnyScan)}
+    assert set(catalog.NAMES) == tags

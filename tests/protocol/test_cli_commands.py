@@ -93,7 +93,7 @@ def test_every_command_has_help(name: str, capsys: Captured) -> None:
         (["scan", "checkerboard", "--leak", "1"], "--leakage: expected float < 1.0"),
         (["scan", "checkerboard", "--tone", "log"], "--tone: expected tone curve: linear, srgb"),
         (["scan", "checkerboard", "--references", "white,grey"], "'grey' is not one of ambient"),
-        (["scan", "checkerboard", "--estimator", "best"], "'best' is not one of maxmin"),
+        (["scan", "checkerboard", "--estimator", "best"], "'best' is not one of auto, lsq, maxmin"),
         (["camera", "--roi", "1,2"], "--roi: expected array of length 4"),
         (["camera", "--roi", "1,b,3,4"], "--roi: '1,b,3,4' is not a list of numbers"),
         (["snap", "-o", "frame.jpg"], "pictures are PNG files"),
@@ -244,6 +244,49 @@ def test_scan_options_become_the_spec(rig: Rig, capsys: Captured) -> None:
         references=(Reference.BLACK, Reference.WHITE),
     )
     assert capsys.readouterr().out == "run-1\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("scan.toml", 'method = "checkerboard"\nshifts = 4\n[radiometry]\ntone = "srgb"\n'),
+        ("scan.json", '{"method": "checkerboard", "shifts": 4, "radiometry": {"tone": "srgb"}}'),
+    ],
+)
+def test_a_scan_from_a_file(name: str, text: str, rig: Rig, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    assert run(["scan", "--file", str(tmp_path / name), "--first"]) == Exit.OK
+    submitted = asked(rig, m.Submit)
+    assert submitted.first
+    assert submitted.spec == Checkerboard(shifts=4, radiometry=Radiometry(tone="srgb"))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("method = 'checkerboard'\nshifts = 1", "Expected int >= 2 - at $.shifts"),
+        ("method = 'chequers'", "Invalid value 'chequers' - at $.method"),
+        ("method = 'stick'\nchecker = 8", "there is an unknown field checker"),
+        ("method: stick", "line 1"),
+    ],
+)
+def test_a_scan_file_with_an_error_is_one_line(
+    text: str, said: str, rig: Rig, tmp_path: Path, capsys: Captured
+) -> None:
+    file = tmp_path / "scan.toml"
+    file.write_text(text)
+    assert run(["scan", "--file", str(file)]) == Exit.USAGE
+    err = capsys.readouterr().err
+    assert err.startswith(f"umbra: {file}: ")
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_scan_options_before_the_method_are_not_lost(rig: Rig, capsys: Captured) -> None:
+    assert run(["scan", "--wait", "two-image"]) == Exit.USAGE
+    assert "--wait belongs after the method" in capsys.readouterr().err
+    assert run(["scan", "--file", "x.toml", "two-image"]) == Exit.USAGE
+    assert not rig.requests
 
 
 def test_scan_without_options_is_the_default(rig: Rig) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from protocol.cli.delivery import Delivery
 from protocol.cli.picture import in_terminal, png
-from protocol.cli.private import toml
+from protocol.cli.private import configured, toml
 from protocol.errors import UmbraError
 
 
@@ -121,6 +121,13 @@ def test_toml_is_read_back() -> None:
     }
     assert tomllib.loads(toml(tables)) == tables
     assert tomllib.loads(toml({"camera": {"bayer": None}})) == {"camera": {}}
+
+
+def test_a_private_daemon_keeps_to_its_folder() -> None:
+    tables = configured({"rig": {"time_scale": 4.0}, "camera": {"driver": "x"}}, Path("/tmp/u"))
+    assert tables["rig"] == {"time_scale": 4.0, "name": "private", "data": "/tmp/u/data"}
+    assert tables["network"] == {"command": "ipc:///tmp/u/command", "events": "ipc:///tmp/u/events"}
+    assert tables["camera"] == {"driver": "x"}
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,7 @@ def _own_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     temporary = tmp_path / "tmp"
     temporary.mkdir()
     monkeypatch.setenv("TMPDIR", str(temporary))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))  # of a daemon with no data folder
     monkeypatch.delenv("UMBRA_RIG", raising=False)
 
 
@@ -83,22 +84,25 @@ def read(path: Path) -> NDArray[Any]:
     return image[..., ::-1]
 
 
-def assert_no_orphan(tmp_path: Path) -> None:
-    """Neither a process nor a file of a private daemon is left."""
+def daemons(tmp_path: Path) -> list[str]:
+    """The command lines of private daemons that work in this test's folder."""
     mark = str(tmp_path).encode()
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = entry.read_bytes()
+        except OSError:
+            continue  # it has ended meanwhile
+        if mark in line and b"daemon.app" in line:
+            found.append(line.decode())
+    return found
 
-    def running() -> list[str]:
-        found = []
-        for entry in Path("/proc").glob("[0-9]*/cmdline"):
-            try:
-                if mark in (line := entry.read_bytes()) and b"daemon.app" in line:
-                    found.append(line.decode())
-            except OSError:
-                continue  # it has ended meanwhile
-        return found
 
-    until(lambda: not running())
-    until(lambda: not list((tmp_path / "tmp").glob("umbra-*")))
+def assert_no_orphan(tmp_path: Path) -> None:
+    """Neither a process nor a file of a private daemon is left, here or in the user's state."""
+    assert not (tmp_path / "state").exists()
+    assert not daemons(tmp_path)
+    assert not list((tmp_path / "tmp").glob("umbra-*"))
 
 
 def test_demo(tmp_path: Path) -> None:
@@ -125,6 +129,9 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
     for line in process.stderr:
         if line.startswith("running"):
             break
+    else:
+        pytest.fail("the demo ended before it ran")
+    assert daemons(tmp_path)
     process.send_signal(number)
     said = process.stderr.read()
     process.stderr.close()
@@ -139,11 +146,10 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
         assert_no_orphan(tmp_path)
     else:  # its folder cannot be cleared away by the dead; the daemon goes all the same
         assert code == -signal.SIGKILL
-        folders = list((tmp_path / "tmp").glob("umbra-*"))
-        for folder in folders:
-            until(lambda folder=folder: not _listens(folder / "command"))  # type: ignore[misc]
-            shutil.rmtree(folder)
-        assert_no_orphan(tmp_path)
+        (folder,) = (tmp_path / "tmp").glob("umbra-*")
+        until(lambda: not _listens(folder / "command"))
+        until(lambda: not daemons(tmp_path))
+        shutil.rmtree(folder)
     assert not (tmp_path / "out").exists()
 
 

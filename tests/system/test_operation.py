@@ -139,6 +139,26 @@ def test_a_frame_that_went_wrong_is_exposed_again(daemon: Daemon, fault: str) ->
     assert "frame exposed again" in daemon.log()
 
 
+@pytest.mark.parametrize(
+    ("call", "seen"),
+    [
+        (2, "not brighter than the black one"),  # white
+        (3, "of the light of white"),  # the first pattern
+        (9, "shows the pattern before its own"),
+    ],
+)
+def test_a_projector_that_is_late_is_seen_by_what_it_shows(
+    daemon: Daemon, call: int, seen: str
+) -> None:
+    # Its time stamps say that all is well; the exposure is over before the image has changed.
+    slow = f'refresh_hz = 10\nfaults = ["late-flip@{call}"]'
+    daemon.configure(projector=slow, camera="exposure_us = 8000", scale=1)
+    with daemon.start() as rig:
+        info = rig.scan(umbra.Checkerboard(shifts=3, shift=5)).wait(60)
+        assert (info.state, info.recorded, info.missing) == (RunState.DONE, 11, 0)
+    assert seen in daemon.log()
+
+
 def test_a_frame_that_cannot_be_had_is_an_explicit_missing_record(daemon: Daemon) -> None:
     faults = ", ".join(f'"drop-trigger@{n}"' for n in (9, 10, 11))
     daemon.configure(camera=f"faults = [{faults}]", more="[sequencer]\nframe_timeout_s = 0.3")

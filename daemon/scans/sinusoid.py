@@ -1,0 +1,96 @@
+"""sin(x + sin y) in shifted phases, and its random-phase kin (§4.3)."""
+
+from __future__ import annotations
+
+from math import tau
+from typing import ClassVar
+
+import numpy as np
+
+from daemon.scans.method import Bench, Unsuitable
+from daemon.scans.pattern_scan import PatternMethod
+from daemon.separation.estimator import Estimator
+from daemon.separation.sinusoid import LeastSquares
+from protocol import patterns
+from protocol.scans import RandomPhase, Sinusoid
+
+
+class SinusoidMethod(PatternMethod[Sinusoid]):
+    """N phases of each period, period by period; each phase 2π/N after the one before."""
+
+    name: ClassVar[str] = "sinusoid"
+    estimators = ("lsq",)
+
+    def __init__(self, spec: Sinusoid, bench: Bench) -> None:
+        shown = [
+            patterns.Sinusoid(period=period, phase=phase, axis=spec.axis, weave=spec.weave)
+            for period in spec.periods
+            for phase in _phases(spec.phases)
+        ]
+        if len(set(spec.periods)) < len(spec.periods):
+            raise Unsuitable("each period is to be named once", "$.periods")
+        super().__init__(spec, bench, shown)
+
+    def described(self) -> str:
+        """See `PatternMethod`."""
+        count = len(self.spec.periods)
+        periods = f" x {count} periods" if count > 1 else ""
+        return f"{self.spec.phases} phases{periods}"
+
+    def counted(self) -> str:
+        """See `PatternMethod`."""
+        return f"{super().counted()} (set --phases or --periods)"
+
+    def estimator(self) -> Estimator:
+        """See `Method`."""
+        projector = self.bench.projector
+        along = None
+        if projector is not None:
+            along = projector.width if self.spec.axis is patterns.Axis.X else projector.height
+        return LeastSquares(
+            self.response,
+            phases=[
+                (frequency, phase)
+                for frequency in range(len(self.spec.periods))
+                for phase in _phases(self.spec.phases)
+            ],
+            leakage=self.leakage,
+            periods=self.spec.periods,
+            size=along,
+            weave=self.spec.weave,
+            axis=self.spec.axis,
+        )
+
+
+class RandomPhaseMethod(PatternMethod[RandomPhase]):
+    """N phases of a pattern in which each patch has a phase of its own."""
+
+    name: ClassVar[str] = "random-phase"
+    estimators = ("lsq",)
+
+    def __init__(self, spec: RandomPhase, bench: Bench) -> None:
+        shown = [
+            patterns.RandomPhase(patch=spec.patch, phase=phase, seed=spec.seed)
+            for phase in _phases(spec.phases)
+        ]
+        super().__init__(spec, bench, shown)
+
+    def described(self) -> str:
+        """See `PatternMethod`."""
+        return f"{self.spec.phases} phases"
+
+    def counted(self) -> str:
+        """See `PatternMethod`."""
+        return f"{super().counted()} (set --phases)"
+
+    def estimator(self) -> Estimator:
+        """See `Method`."""
+        return LeastSquares(
+            self.response,
+            phases=[(0, phase) for phase in _phases(self.spec.phases)],
+            leakage=self.leakage,
+        )
+
+
+def _phases(count: int) -> list[float]:
+    return [float(phase) for phase in np.arange(count) * (tau / count)]

@@ -1,0 +1,204 @@
+"""Separation of one image under fine stripes, at a lower resolution (§4.4)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation import light_model
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation
+from daemon.separation.finish import Judgement, finish
+from daemon.separation.noise import from_frame
+from daemon.separation.radiometry import FrameMean, Plane, Response
+from daemon.separation.references import References
+
+
+class PeaksAndValleys:
+    """The newest image -> direct, global at 1/`reduce` of its size.
+
+    A pixel is a peak (valley) when it is the brightest (darkest) of `window` pixels across the
+    stripes by `along` pixels along them. Light between peaks is interpolated across the stripes and
+    averaged over `reduce` x `reduce` pixels; likewise between valleys; then Eq. 8. Each colour of a
+    mosaic is a picture of its own, of half the size. Every image is separated on its own, so a
+    stream of them is separated live; memory does not grow.
+    """
+
+    def __init__(
+        self,
+        response: Response,
+        *,
+        lit_fraction: float,
+        leakage: float,
+        window: int = 11,
+        along: int = 1,
+        reduce: int = 4,
+        across: str = "x",
+    ) -> None:
+        if response.bayer and reduce % 2:
+            raise ValueError(
+                "a mosaic is reduced by an even number: its colours are 2 pixels apart"
+            )
+        self._response = response
+        self._alpha = lit_fraction
+        self._leakage = leakage
+        self._window = window
+        self._along = along
+        self._reduce = reduce
+        self._across = across
+        self._references = References(response)
+        self._mean = FrameMean(response)
+        self._open: int | None = None
+        self._picture: Plane | None = None
+        self._saturated: NDArray[np.bool_] | None = None
+        self._clipped: NDArray[np.bool_] | None = None  # of the frames being averaged
+        self._images = 0
+        self._unused = 0
+
+    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
+        """See `Estimator`. Raises ValueError for an observation that cannot be respected."""
+        if observation.strength != 1.0 or observation.warp is not None:
+            raise ValueError("a single image is taken as it is: no warp, strength 1")
+        if not observation.used:
+            self._unused += 1
+        elif observation.lighting is not Lighting.PATTERN:
+            self._references.add(pixels, observation.lighting)
+            return
+        else:
+            if self._open is not None and self._open != observation.pattern:
+                self._close()
+            self._open = observation.pattern
+            self._mean.add(pixels)
+            clipped = pixels >= self._response.saturated_from
+            self._clipped = clipped if self._clipped is None else self._clipped | clipped
+        if observation.last and observation.lighting is Lighting.PATTERN:
+            self._close()
+
+    def _close(self) -> None:
+        if self._mean.frames:
+            self._picture = self._mean.value()
+            self._saturated = self._clipped
+            self._images += 1
+        self._mean.clear()
+        self._clipped, self._open = None, None
+
+    def result(self) -> Components:
+        """See `Estimator`. Raises NotYet before an image is in."""
+        if self._picture is None or self._saturated is None:
+            raise NotYet("no image has come yet")
+        picture = self._picture
+        lit, unlit = self._extremes(picture)
+        ambient, source = self._references.ambient(
+            lit, unlit, self._alpha, self._leakage, self._reduced
+        )
+        brightest = lit
+        if ambient is not None:
+            lit, unlit = lit - ambient, unlit - ambient
+        direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
+        saturated = self._reduced(self._saturated.astype(np.float32)) > 0
+        deviation = self._deviation(picture, brightest)
+        plain = Response(
+            self._response.full_scale,
+            self._response.black,
+            self._response.tone,
+            self._response.saturation,
+        )
+        return finish(
+            direct,
+            indirect,
+            response=plain,
+            brightest=brightest,
+            saturated=saturated,
+            judgement=Judgement.of_extremes(deviation, self._window * self._along),
+            facts={
+                "estimator": "peaks and valleys",
+                "images": self._images,
+                "unused_frames": self._unused,
+                "lit_fraction": self._alpha,
+                "leakage": self._leakage,
+                "reduced_by": self._reduce,
+                "noise_from": "one picture",
+                **self._references.facts(source),
+            },
+        )
+
+    def summary(self) -> dict[str, float]:
+        """Images separated, and frames not used."""
+        return {"images": float(self._images), "unused": float(self._unused)}
+
+    def _deviation(self, picture: Plane, brightest: Plane) -> Plane:
+        counts = self._response.counts(picture)
+        noise = from_frame(counts, self._response.full_scale, self._response.bayer)
+        return self._response.deviation(noise, self._response.counts(brightest))
+
+    def _extremes(self, picture: Plane) -> tuple[Plane, Plane]:
+        """L_max and L_min at the lower resolution, RGB for a mosaic."""
+        if not self._response.bayer:
+            lit, unlit = self._both(picture, self._window, self._along)
+            return self._reduced(lit), self._reduced(unlit)
+        lit, unlit = np.empty_like(picture), np.empty_like(picture)
+        window, along = (max(n // 2, 1) | 1 for n in (self._window, self._along))
+        for y in range(2):
+            for x in range(2):
+                colour = np.ascontiguousarray(picture[y::2, x::2])
+                lit[y::2, x::2], unlit[y::2, x::2] = self._both(colour, window, along)
+        return self._reduced(lit), self._reduced(unlit)
+
+    def _both(self, picture: Plane, window: int, along: int) -> tuple[Plane, Plane]:
+        if self._across == "y":
+            turned = np.ascontiguousarray(np.swapaxes(picture, 0, 1))
+            lit, unlit = envelope(turned, window, along), -envelope(-turned, window, along)
+            return np.swapaxes(lit, 0, 1), np.swapaxes(unlit, 0, 1)
+        return envelope(picture, window, along), -envelope(-picture, window, along)
+
+    def _reduced(self, plane: Plane) -> Plane:
+        """Means over squares; of a mosaic the means of each colour, as RGB."""
+        k, bayer = self._reduce, self._response.bayer
+        height, width = (n // k for n in plane.shape[:2])
+        if height == 0 or width == 0:
+            raise ValueError(f"an image of {plane.shape[1]} x {plane.shape[0]} cannot be 1/{k}")
+        cropped = plane[: height * k, : width * k]
+        if not bayer:
+            return block_mean(plane, k)
+        sites = cropped.reshape(height, k // 2, 2, width, k // 2, 2).mean(axis=(1, 4))
+        below = {"RG": "GB", "GR": "BG", "GB": "RG", "BG": "GR"}[bayer]
+        rgb = np.zeros((height, width, 3), dtype=np.float32)
+        for y, row in enumerate((bayer, below)):
+            for x, colour in enumerate(row):
+                share = np.float32(0.5 if colour == "G" else 1.0)
+                rgb[..., "RGB".index(colour)] += share * sites[:, y, :, x]
+        return rgb
+
+
+def block_mean(plane: Plane, k: int) -> Plane:
+    """Means over squares of k x k pixels: (H//k, W//k, ...) float32; what is over is left out."""
+    height, width = plane.shape[0] // k, plane.shape[1] // k
+    squares = plane[: height * k, : width * k].reshape(height, k, width, k, *plane.shape[2:])
+    return np.asarray(squares.mean(axis=(1, 3), dtype=np.float32))
+
+
+def envelope(picture: Plane, window: int, along: int) -> Plane:
+    """Light between the peaks of each row, interpolated: float32, the shape of `picture`.
+
+    A peak is the brightest of `window` x `along` pixels around it; before the first and after the
+    last one of a row its light goes on; a row without one takes the window's brightest.
+    """
+    kernel = np.ones((along, window), dtype=np.uint8)
+    highest = np.asarray(cv2.dilate(picture, kernel, borderType=cv2.BORDER_REPLICATE))
+    highest = highest.reshape(picture.shape)
+    peak = picture >= highest
+    columns = picture.shape[1]
+    shape = (1, columns) + (1,) * (picture.ndim - 2)
+    at = np.broadcast_to(np.arange(columns, dtype=np.int32).reshape(shape), picture.shape)
+    before = np.maximum.accumulate(np.where(peak, at, np.int32(-1)), axis=1)
+    after = np.where(peak, at, np.int32(columns))[:, ::-1]
+    after = np.minimum.accumulate(after, axis=1)[:, ::-1]
+    none = (before < 0) & (after >= columns)
+    before, after = np.where(before < 0, after, before), np.where(after >= columns, before, after)
+    left = np.take_along_axis(picture, np.clip(before, 0, columns - 1), axis=1)
+    right = np.take_along_axis(picture, np.clip(after, 0, columns - 1), axis=1)
+    gap = np.maximum(after - before, 1).astype(np.float32)
+    between: Plane = left + (right - left) * ((at - before).astype(np.float32) / gap)
+    return np.where(none, highest, between)

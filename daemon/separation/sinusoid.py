@@ -1,0 +1,311 @@
+"""Separation from sinusoids in time, by least squares in constant memory (§4.3).
+
+A pixel that sees a source element of brightness b + (1 - b)(½ + ½ sin(φ + δ)) has, over the phases
+δ, the mean M = ½(1 + b)(L_d + L_g) and the amplitude B = ½(1 - b) L_d. Three sums a frequency
+(I, I cos δ, I sin δ) hold all that a fit of M, B and φ needs, whatever the number of frames, and
+whichever are missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation import correspondence
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
+from daemon.separation.noise import Noise
+from daemon.separation.radiometry import Plane, Response
+from daemon.separation.references import References
+from daemon.separation.scan_noise import ResidualNoise
+
+_LEAST_ECCENTRIC = 0.02
+"""Least ratio of the fit's eigenvalues: phases that nearly coincide don't tell M, B, φ apart."""
+
+_DISAGREE = 5.0
+"""Frequencies disagree when their direct components differ by so many standard deviations ..."""
+_DISAGREE_PART = 0.1
+"""... and by this part of the light: a smaller difference is a bend of the projector's curve."""
+
+
+class LeastSquares:
+    """Frames of N >= 3 phases of one or several sinusoids -> direct, global, φ.
+
+    `phases[i]` is pattern i's (frequency, δ in radians). Planes: `direct_std`, `global_std` (as the
+    components), `phase` (H, W) in 0..2π of the first frequency, and `column` or `row` (H, W) in
+    projector pixels where `periods` say how to get it.
+    """
+
+    def __init__(
+        self,
+        response: Response,
+        *,
+        phases: Sequence[tuple[int, float]],
+        leakage: float,
+        periods: Sequence[float] = (),
+        size: int | None = None,
+        weave: float = 0.0,
+        axis: str = "x",
+    ) -> None:
+        self._response = response
+        self._phases = tuple(phases)
+        self._leakage = leakage
+        self._periods = tuple(periods)
+        self._size = size
+        self._weave = weave
+        self._axis = axis
+        self._references = References(response)
+        self._fits = [_Fit() for _ in range(1 + max(f for f, _ in phases))]
+        self._noise = ResidualNoise(response)
+        self._saturated: NDArray[np.bool_] | None = None
+        self._unused = 0
+
+    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
+        """See `Estimator`. Raises ValueError for an observation that cannot be respected."""
+        if observation.strength != 1.0 or observation.warp is not None:
+            raise ValueError("a sinusoid is fitted to frames as they are: no warp, strength 1")
+        if not observation.used:
+            self._unused += 1
+            return
+        if observation.lighting is not Lighting.PATTERN:
+            self._references.add(pixels, observation.lighting)
+            return
+        frequency, delta = self._phases[observation.pattern]
+        light = self._response.linear(pixels)
+        self._fits[frequency].add(light, delta)
+        self._noise.add(pixels, light, frequency, delta)
+        if self._saturated is None:
+            self._saturated = np.zeros(pixels.shape, dtype=np.bool_)
+        self._saturated |= pixels >= self._response.saturated_from
+
+    def result(self) -> Components:
+        """See `Estimator`. Raises NotYet before a frequency has three phases."""
+        ready = [fit for fit in self._fits if fit.solvable]
+        if not ready or self._saturated is None:
+            raise NotYet("a sinusoid needs 3 phases; they have not all come yet")
+        noise = self._noise.noise()
+        blur = self._blur(ready)
+        solved = [
+            self._separate(fit, noise, gain)
+            for fit, gain in zip(ready, self._gains(blur, len(ready)), strict=True)
+        ]
+        direct, indirect, direct_var, global_var = _combine(solved)
+        brightest = np.maximum.reduce([fit.brightest() for fit in ready])
+        quality = np.zeros(direct.shape[:2], dtype=np.uint16)
+        if len(solved) > 1:
+            quality |= bits(_disagree(solved), Quality.DISAGREE)
+        planes: dict[str, NDArray[Any]] = {
+            "direct_std": np.sqrt(direct_var),
+            "global_std": np.sqrt(global_var),
+        }
+        planes.update(self._correspondence(ready))
+        ratio = self._mean_ratio(ready[0])
+        facts: dict[str, Any] = {
+            "estimator": "lsq",
+            "patterns": sum(fit.frames for fit in self._fits),
+            "frequencies": len(ready),
+            "blur_px": None if blur is None else round(blur, 3),
+            "unused_frames": self._unused,
+            "lit_fraction": 0.5,
+            "leakage": self._leakage,
+            "noise_from": self._noise.source,
+            **self._references.facts(
+                self._references.total(ready[0].solve()[0], self._leakage).source
+            ),
+            **ratio,
+            "advice": _advice(ratio),
+        }
+        return finish(
+            direct,
+            indirect,
+            response=self._response,
+            brightest=brightest,
+            saturated=self._saturated,
+            judgement=Judgement(
+                direct=np.float32(SIGNIFICANT) * planes["direct_std"],
+                total=np.float32(SIGNIFICANT) * planes["global_std"],
+                deviation=self._level(ready[0], noise),
+            ),
+            flags=quality,
+            planes=planes,
+            facts=facts,
+        )
+
+    def summary(self) -> dict[str, float]:
+        """Frames fitted, frequencies that have a fit, frames not used."""
+        return {
+            "frames": float(sum(fit.frames for fit in self._fits)),
+            "frequencies": float(sum(fit.solvable for fit in self._fits)),
+            "unused": float(self._unused),
+        }
+
+    def _blur(self, ready: list[_Fit]) -> float | None:
+        """The blur of projector and camera together, in projector pixels; None from one period.
+
+        Blur of standard deviation s takes exp(-2π²s²f²) from a wave of frequency f, so the ratio of
+        two waves' amplitudes tells s. The median over the scene is taken: scattering within the
+        scene, which is global light, differs from place to place and stays in the amplitudes.
+        """
+        if len(ready) < 2 or len(ready) != len(self._periods):
+            return None
+        squares = self._squared_frequencies()
+        logs = []
+        first = None
+        for fit in ready:
+            _, cosine, sine = fit.solve()
+            power = (cosine * cosine + sine * sine)[::2, ::2]
+            first = power if first is None else first
+            bright = first > np.quantile(first, 0.5)
+            ratio = power[bright] / np.maximum(first[bright], np.float32(1e-12))
+            logs.append(0.5 * float(np.log(np.maximum(np.median(ratio), 1e-6))))
+        slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
+        return float(np.sqrt(max(-slope, 0.0) / (2.0 * np.pi**2)))
+
+    def _squared_frequencies(self) -> NDArray[np.float64]:
+        """Mean square of each wave's spatial frequency; its weave makes it higher along the other
+        axis."""
+        squares: NDArray[np.float64] = 1.0 / np.square(np.asarray(self._periods))
+        return squares * (1.0 + 0.5 * self._weave**2)
+
+    def _gains(self, blur: float | None, count: int) -> list[float]:
+        """What gives each wave its amplitude back."""
+        if not blur:
+            return [1.0] * count
+        return [float(g) for g in np.exp(2.0 * np.pi**2 * blur**2 * self._squared_frequencies())]
+
+    def _separate(
+        self, fit: _Fit, noise: Noise | None, gain: float
+    ) -> tuple[Plane, Plane, Plane, Plane]:
+        """Direct, global and their variances from one frequency."""
+        mean, cosine, sine = fit.solve()
+        b = self._leakage
+        sigma = self._response.deviation(noise, self._response.counts(mean))
+        mean_var, wave_var = fit.variances()
+        power = cosine * cosine + sine * sine
+        if self._noise.measured:
+            # |B| of noise alone is not 0: to first order its square is too large by one variance.
+            power = np.maximum(power - np.float32(wave_var) * sigma * sigma, 0)
+        amplitude: Plane = np.sqrt(power)
+        direct: Plane = amplitude * np.float32(2.0 * gain / (1.0 - b))
+        total = self._references.total(mean, b)
+        indirect: Plane = total.light - direct
+        variance = sigma * sigma
+        direct_var: Plane = variance * np.float32(wave_var * (2.0 * gain / (1.0 - b)) ** 2)
+        total_var: Plane = variance * np.float32(mean_var * total.of_half + total.of_frame)
+        return direct, indirect, direct_var, direct_var + total_var
+
+    def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
+        mean, _, _ = fit.solve()
+        return self._response.deviation(noise, self._response.counts(mean))
+
+    def _mean_ratio(self, fit: _Fit) -> dict[str, float]:
+        """Median of M/½(W + K): 1 where the projector's tone curve is linear."""
+        black = self._references.mean(Lighting.BLACK)
+        white = self._references.mean(Lighting.WHITE)
+        if black is None or white is None:
+            return {}
+        half = (white + black) * np.float32(0.5)
+        bright = half > 0.1 * float(np.quantile(half, 0.99))
+        mean = fit.solve()[0]
+        return {"mean_ratio": round(float(np.median(mean[bright] / half[bright])), 4)}
+
+    def _correspondence(self, ready: list[_Fit]) -> dict[str, NDArray[Any]]:
+        """Wrapped phase of the first frequency, and where the projector lit each pixel."""
+        waves = []
+        for fit in ready:
+            _, cosine, sine = fit.solve()
+            if cosine.ndim == 3:
+                cosine, sine = cosine.sum(axis=2), sine.sum(axis=2)
+            wave: Plane = np.arctan2(cosine, sine) % np.float32(2 * np.pi)
+            waves.append(wave)
+        planes: dict[str, NDArray[Any]] = {"phase": waves[0]}
+        if len(ready) == len(self._periods) > 1 and self._size is not None and self._weave == 0.0:
+            name = "column" if self._axis == "x" else "row"
+            planes[name] = correspondence.unwrap(waves, self._periods, self._size)
+        return planes
+
+
+class _Fit:
+    """Sums of one frequency: ΣI, ΣI cos δ, ΣI sin δ, and those of the design."""
+
+    def __init__(self) -> None:
+        self._sums: Plane | None = None
+        self._scaled: Plane | None = None
+        self._normal = np.zeros((3, 3))
+        self.frames = 0
+
+    def add(self, light: Plane, delta: float) -> None:
+        if self._sums is None or self._scaled is None:
+            self._sums = np.zeros((3, *light.shape), dtype=np.float32)
+            self._scaled = np.empty_like(light)
+        row = np.array([1.0, np.cos(delta), np.sin(delta)])
+        self._sums[0] += light
+        for index in (1, 2):
+            np.multiply(light, np.float32(row[index]), out=self._scaled)
+            self._sums[index] += self._scaled
+        self._normal += np.outer(row, row)
+        self.frames += 1
+
+    @property
+    def solvable(self) -> bool:
+        if self.frames < 3:
+            return False
+        values = np.linalg.eigvalsh(self._normal)
+        return bool(values[0] > _LEAST_ECCENTRIC * values[-1])
+
+    def solve(self) -> tuple[Plane, Plane, Plane]:
+        """M, and the factors of cos δ and sin δ: B sin φ, B cos φ."""
+        assert self._sums is not None, "only a solvable fit is solved"
+        inverse = np.linalg.inv(self._normal).astype(np.float32)
+        found = np.tensordot(inverse, self._sums, axes=1)
+        return found[0], found[1], found[2]
+
+    def variances(self) -> tuple[float, float]:
+        """Variance of M and of one factor of the wave for samples of variance 1."""
+        inverse = np.linalg.inv(self._normal)
+        return float(inverse[0, 0]), float((inverse[1, 1] + inverse[2, 2]) / 2)
+
+    def brightest(self) -> Plane:
+        """Light at the crest of the fitted wave."""
+        mean, cosine, sine = self.solve()
+        crest: Plane = mean + np.hypot(cosine, sine)
+        return crest
+
+
+def _combine(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> tuple[Plane, Plane, Plane, Plane]:
+    """The mean over frequencies; their frames are independent and equally many."""
+    if len(solved) == 1:
+        return solved[0]
+    direct, indirect, direct_var, global_var = (
+        np.add.reduce(planes) * np.float32(1.0 / len(solved))
+        for planes in zip(*solved, strict=True)
+    )
+    share = np.float32(1.0 / len(solved))
+    return direct, indirect, direct_var * share, global_var * share
+
+
+def _disagree(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> NDArray[np.bool_]:
+    """Where the direct components of any two frequencies differ by more than noise explains."""
+    directs = np.stack([one[0] for one in solved])
+    variance = np.maximum.reduce([one[2] for one in solved])
+    total = np.maximum.reduce([one[0] + one[1] for one in solved])
+    apart = directs.max(axis=0) - directs.min(axis=0)
+    limit = np.maximum(
+        np.float32(_DISAGREE * np.sqrt(2.0)) * np.sqrt(variance), np.float32(_DISAGREE_PART) * total
+    )
+    differ = apart > limit
+    return differ if differ.ndim == 2 else np.asarray(np.logical_or.reduce(differ, axis=2))
+
+
+def _advice(ratio: dict[str, float]) -> list[str]:
+    found = ratio.get("mean_ratio")
+    if found is None or abs(found - 1.0) < 0.03:
+        return []
+    return [
+        f"the mean over the phases is {found:.2f} of half the light, not 1: the projector's or the "
+        "camera's tone curve is not linear, and global is wrong by as much: run `umbra calibrate "
+        "tone`, or give the camera's curve with --tone"
+    ]

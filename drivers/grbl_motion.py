@@ -1,0 +1,148 @@
+"""Motions as lines of G-code, the limits that they keep to, and the stream that carries them.
+
+Straight lines go to absolute machine positions (G53): work offsets do not matter. Arcs cannot (Grbl
+refuses G53 with them) and are incremental: whole turns end where they began, so nothing adds up,
+and they are independent of offsets too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from drivers.base import DeviceRefused, StageInfo
+from drivers.grbl_link import GrblLink
+from drivers.grbl_protocol import Build
+from drivers.track import Arc, Point
+
+Range = tuple[float, float]
+
+MODES = "G21G17G94G90"  # mm, XY plane, feed in mm/min, absolute: set after each reset
+
+LEAST_TURN = 1e-4  # of a turn; less is rounding
+
+
+def line(machine: Point, feed_mm_s: float) -> str:
+    """To a machine position."""
+    return f"G53G1{_target(machine)}F{feed_mm_s * 60:.1f}"
+
+
+def jog(machine: Point, feed_mm_s: float) -> str:
+    """To a machine position, by Grbl's own jog."""
+    return f"$J=G53{_target(machine)}F{feed_mm_s * 60:.1f}"
+
+
+def _target(machine: Point) -> str:
+    return f"X{machine[0]:.4f}Y{machine[1]:.4f}"
+
+
+def arcs(radius_mm: float, feed_mm_s: float, turns: float) -> Iterator[str]:
+    """Counter-clockwise from a circle's point at angle 0: a line a turn, then the rest of one.
+
+    `turns` may be infinite.
+    """
+    r, feed = radius_mm, f"F{feed_mm_s * 60:.1f}"
+    whole = turns if math.isinf(turns) else math.floor(turns + LEAST_TURN)
+    done = 0
+    while done < whole:
+        yield f"G91G3X0Y0I{-r:.4f}J0{feed}"
+        done += 1
+    if turns - done > LEAST_TURN:
+        end = math.tau * (turns - done)
+        dx, dy = r * (math.cos(end) - 1), r * math.sin(end)
+        yield f"G91G3X{dx:.4f}Y{dy:.4f}I{-r:.4f}J0{feed}"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What is checked before anything is sent. Each check raises DeviceRefused."""
+
+    device: str
+    info: StageInfo
+
+    def check_feed(self, phase: str, feed: float) -> None:
+        """`feed` in mm/s."""
+        most = self.info.max_feed_mm_s
+        if not 0 < feed <= most * (1 + 1e-9):
+            raise DeviceRefused(
+                self.device, phase, f"a feed of {feed:g} mm/s", f"it takes up to {most:g} mm/s"
+            )
+
+    def check_box(self, phase: str, x: Range, y: Range) -> None:
+        """That all of it is within the travel; names the axis, the value and the limit."""
+        for axis, box, travel in zip("xy", (x, y), self.info.travel_mm, strict=True):
+            for value in box:
+                if not travel[0] <= value <= travel[1]:  # false for nan too
+                    raise DeviceRefused(
+                        self.device,
+                        phase,
+                        f"{axis} = {value:g} mm is outside {travel[0]:g} to {travel[1]:g} mm, its "
+                        "travel",
+                        "nothing was sent; aim within the travel",
+                    )
+
+    def check_circle(self, phase: str, arc: Arc, turns: float) -> None:
+        """The whole circle, however little of it is gone round."""
+        (x, y), r = arc.centre, arc.radius
+        if not (math.isfinite(r) and r > 0):
+            raise DeviceRefused(self.device, phase, f"its radius is {r} mm", "above 0")
+        if not turns > 0:
+            raise DeviceRefused(self.device, phase, f"{turns} turns were asked", "above 0")
+        self.check_box(phase, (x - r, x + r), (y - r, y + r))
+
+
+def machine_travel(settings: dict[int, float], build: Build, axis: int) -> Range | None:
+    """Least and greatest machine position of an axis, from $130 and $131; None if not told.
+
+    Grbl homes to 0 at one end, and counts down from there wherever the switch is ($23), unless it
+    was built to set the origin at the switch (Z in $I; grblHAL: bit 3 of $22).
+    """
+    length = settings.get(130 + axis)
+    if not length:
+        return None
+    homes_low = int(settings.get(23, 0)) >> axis & 1
+    sets_origin = "Z" in build.options or int(settings.get(22, 0)) & 8
+    low = 0.0 if sets_origin and homes_low else -length
+    return low, low + length
+
+
+class Stream:
+    """Motions that wait, each a series of lines, and are sent as the controller takes them."""
+
+    def __init__(self, link: GrblLink) -> None:
+        self._link = link
+        self._motions: deque[Iterator[str]] = deque()
+        self._line: str | None = None  # has no room yet
+
+    @property
+    def empty(self) -> bool:
+        """Whether every line was sent."""
+        return not self._motions and self._line is None
+
+    def add(self, lines: Iterator[str]) -> None:
+        """Queue a motion."""
+        self._motions.append(lines)
+
+    def clear(self) -> None:
+        """Forget what was not sent."""
+        self._motions.clear()
+        self._line = None
+
+    def feed(self) -> None:
+        """Send as many lines as the controller's receive buffer has room for."""
+        while (text := self._line or self._next()) is not None:
+            self._line = text
+            if not self._link.room(text):
+                return
+            self._line = None
+            self._link.send(text)
+
+    def _next(self) -> str | None:
+        while self._motions:
+            text = next(self._motions[0], None)
+            if text is not None:
+                return text
+            self._motions.popleft()
+        return None

@@ -1,0 +1,98 @@
+"""A small scene under any pattern, for the methods' tests: light is added up, not formulas.
+
+A camera pixel sees one projector pixel; global light is a wide blur of what was emitted, times an
+albedo, so that α is nowhere used. Noise is Gaussian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon import patterns
+from daemon.scans import catalog
+from daemon.scans.method import Bench, Expose, Taken
+from daemon.separation.estimator import Components
+from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from protocol.patterns import BLACK
+from protocol.scans import AnyScan
+
+FULL = 65535
+
+
+@dataclass
+class Scene:
+    """Counts of a 16-bit camera; every number is a fraction of full scale."""
+
+    width: int = 128
+    height: int = 96
+    leakage: float = 0.0
+    ambient: float = 0.0
+    sigma: float = 0.0
+    blur: float = 0.0  # of the projector, px
+    reach: float = 40.0  # of global light, px
+    gamma: float = 1.0  # of the projector
+    change: Callable[[NDArray[Any], Expose], NDArray[Any]] = field(default=lambda light, _: light)
+
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(11)
+        smooth = cv2.GaussianBlur(rng.standard_normal((self.height, self.width)), (0, 0), 6)
+        smooth = smooth / np.abs(smooth).max()
+        self.albedo_direct = 0.4 + 0.15 * smooth
+        self.albedo_global = 0.15 - 0.08 * smooth[::-1]
+
+    @property
+    def direct(self) -> NDArray[np.float64]:
+        """Direct light under white, in counts."""
+        return np.asarray(self.albedo_direct * FULL)
+
+    @property
+    def indirect(self) -> NDArray[np.float64]:
+        """Global light under white, in counts."""
+        return np.asarray(self.albedo_global * FULL)
+
+    def frame(self, step: Expose, rng: np.random.Generator) -> NDArray[np.uint16]:
+        """What the camera counts under a step's pattern."""
+        light: NDArray[Any] = np.full((self.height, self.width), self.ambient * FULL)
+        if step.pattern is not None:
+            shown = patterns.render(step.pattern, self.width, self.height) / 255.0
+            emitted: Any = self.leakage + (1 - self.leakage) * shown**self.gamma
+            if self.blur:
+                emitted = cv2.GaussianBlur(emitted, (0, 0), self.blur)
+            around = cv2.blur(emitted, (65, 65), borderType=cv2.BORDER_REFLECT)
+            around = cv2.GaussianBlur(around, (0, 0), self.reach, borderType=cv2.BORDER_REFLECT)
+            light = light + emitted * self.direct + around * self.indirect
+        light = self.change(light, step) + rng.normal(0, 1, light.shape) * self.sigma * FULL
+        return np.asarray(np.rint(np.clip(light, 0, FULL)), dtype=np.uint16)
+
+    def bench(self) -> Bench:
+        """A live bench that sees it."""
+        return Bench(
+            CameraInfo(self.width, self.height, PixelFormat.MONO16),
+            ProjectorInfo(self.width, self.height, refresh_hz=60),
+        )
+
+    def scan(self, spec: AnyScan, seed: int = 1) -> Components:
+        """The whole of a scan, as the daemon does it."""
+        rng = np.random.default_rng(seed)
+        method = catalog.method_for(spec, self.bench())
+        estimator = method.estimator()
+        index = 0
+        while (step := method.step(index, estimator.summary())) is not None:
+            assert isinstance(step, Expose)
+            for sub in range(step.frames):
+                observation = method.observe(step, Taken(index, sub, incomplete=False))
+                estimator.update(self.frame(step, rng), observation)
+            index += 1
+        assert index
+        result = estimator.result()
+        assert isinstance(result, Components)
+        return method.conclude(result)
+
+
+DARK = Expose(BLACK)

@@ -1,0 +1,655 @@
+"""The Grbl driver against a byte-level controller: what goes right, and what goes wrong."""
+
+from __future__ import annotations
+
+import math
+import random
+import statistics
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers import grbl_protocol as grbl
+from drivers.base import (
+    Context,
+    DeviceError,
+    DeviceGarbled,
+    DeviceLost,
+    DeviceRefused,
+    DeviceTimeout,
+    StageState,
+    StageStatus,
+)
+from drivers.clock import NS, Clock, RealClock, ScaledClock
+from drivers.grbl import GrblOptions, GrblStage
+from tests.drivers.grbl_peer import GrblPeer, Settings
+
+pytestmark = pytest.mark.timeout(20)
+
+FEED = 40.0  # mm/s
+CENTRE = (-10.0, -10.0)
+
+
+@pytest.fixture
+def peer(tmp_path: Path) -> Iterator[GrblPeer]:
+    with GrblPeer(tmp_path, speed=2.0, resets_on_open=False) as peer:
+        yield peer
+
+
+def make(peer: GrblPeer, clock: Clock | None = None, **options: object) -> GrblStage:
+    usual: dict[str, object] = {"port": str(peer.link), "boot_s": 1.0, "poll_hz": 20.0}
+    return GrblStage(
+        "stage",
+        msgspec.convert(usual | options, GrblOptions),
+        Context(clock=clock or ScaledClock(peer.speed)),
+    )
+
+
+@pytest.fixture
+def stage(peer: GrblPeer) -> Iterator[GrblStage]:
+    stage = make(peer)
+    stage.connect()
+    yield stage
+    stage.close()
+
+
+@pytest.fixture
+def homed(stage: GrblStage) -> GrblStage:
+    stage.home(10.0)
+    return stage
+
+
+def pump_until(
+    stage: GrblStage, done: Callable[[StageStatus], bool], seconds: float = 12.0
+) -> StageStatus:
+    """Pump as the daemon does; the time is a limit, not a criterion."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        status = stage.pump()
+        if done(status):
+            return status
+        time.sleep(0.005)
+    raise AssertionError(f"not within {seconds} s: {stage.pump()}")
+
+
+def at_rest(status: StageStatus) -> bool:
+    return status.state is StageState.IDLE
+
+
+def moving(status: StageStatus) -> bool:
+    return status.state is StageState.MOVING and status.position_mm is not None
+
+
+# ---------------------------------------------------------------- connecting
+
+
+@pytest.mark.parametrize("resets", [True, False])
+def test_connects_to_boards_that_reset_on_opening_and_to_those_that_do_not(
+    tmp_path: Path, resets: bool
+) -> None:
+    made = Settings(label="BENCH-1")  # as Grbl keeps `$I=bench-1`
+    with GrblPeer(tmp_path, resets_on_open=resets, boot_s=0.2, settings=made) as peer:
+        stage = make(peer, identity="bench")
+        identity = stage.connect()
+        assert (identity.model, identity.serial) == ("Grbl", "BENCH-1")
+        assert identity.firmware == "1.1h.20190830"
+        info = stage.info()
+        assert info.travel_mm == ((-40.0, 0.0), (-40.0, 0.0))
+        assert info.max_feed_mm_s == 50.0
+        assert info.max_acceleration_mm_s2 == 500.0
+        assert stage.status().state is StageState.UNKNOWN
+        assert (b"\x18" in peer.realtime) is not resets
+        stage.close()
+        stage.close()
+
+
+def test_grblhal_and_fluidnc_are_recognised(tmp_path: Path) -> None:
+    for text, name in [
+        ("GrblHAL 1.1f ['$' or '$HELP' for help]", "grblHAL"),
+        ("Grbl 3.7 [FluidNC v3.7.8 (wifi) '$' for help]", "FluidNC"),
+    ]:
+        with GrblPeer(tmp_path, resets_on_open=False, settings=Settings(banner=text)) as peer:
+            stage = make(peer)
+            assert stage.connect().model == name
+            stage.close()
+
+
+@pytest.mark.parametrize(
+    ("made", "options", "words"),
+    [
+        (Settings(banner="Grbl 0.9j ['$' for help]"), {}, "install Grbl 1.1"),
+        (Settings(label="other"), {"identity": "bench"}, "not 'bench'"),
+        (Settings(), {"homing": "here"}, "travel_mm"),
+        (Settings(), {"travel_mm": [[5, 5], [0, 1]]}, "empty"),
+    ],
+)
+def test_refuses_what_it_cannot_work_with(
+    tmp_path: Path, made: Settings, options: dict[str, Any], words: str
+) -> None:
+    with GrblPeer(tmp_path, resets_on_open=False, settings=made) as peer:
+        stage = make(peer, **options)
+        with pytest.raises(DeviceRefused, match=words):
+            stage.connect()
+        with pytest.raises(DeviceLost, match="not connected"):
+            stage.status()
+
+
+def test_nothing_answers(tmp_path: Path) -> None:
+    with GrblPeer(tmp_path, resets_on_open=False) as peer:
+        peer.faults.mute = True
+        with pytest.raises(DeviceTimeout, match=r"no answer .* 115200 baud"):
+            make(peer, ScaledClock(10)).connect()
+
+
+def test_something_else_answers(tmp_path: Path) -> None:
+    made = Settings(banner="Marlin 2.1 ready")
+    with (
+        GrblPeer(tmp_path, boot_s=0.0, settings=made) as peer,
+        pytest.raises(DeviceGarbled, match="Marlin"),
+    ):
+        make(peer, ScaledClock(5)).connect()
+
+
+def test_there_is_no_port(tmp_path: Path) -> None:
+    stage = GrblStage("stage", GrblOptions(port=str(tmp_path / "none")), Context())
+    with pytest.raises(DeviceLost, match="there is no"):
+        stage.connect()
+    stage.halt()
+    stage.safe()
+    stage.close()
+
+
+def test_a_second_opener_is_refused(peer: GrblPeer, stage: GrblStage) -> None:
+    with pytest.raises(DeviceRefused, match="in use by another program"):
+        make(peer).connect()
+    assert stage.status().state is StageState.UNKNOWN
+
+
+# ---------------------------------------------------------------- homing and limits
+
+
+def test_nothing_moves_before_homing(peer: GrblPeer, stage: GrblStage) -> None:
+    sent = list(peer.lines)
+    motions: tuple[Callable[[], None], ...] = (
+        lambda: stage.move(-5, -5, FEED),
+        lambda: stage.circle(CENTRE, 1.5, FEED, 1),
+        lambda: stage.jog(-5, -5, FEED),
+    )
+    for motion in motions:
+        with pytest.raises(DeviceRefused, match="home"):
+            motion()
+    assert stage.position_at(stage.clock.now_ns()) is None
+    assert peer.lines == sent
+    stage.unlock()
+    assert stage.status().state is StageState.UNKNOWN
+    with pytest.raises(DeviceRefused, match="home"):
+        stage.move(-5, -5, FEED)
+
+
+def test_homing_gives_a_position(homed: GrblStage) -> None:
+    status = homed.status()
+    assert (status.state, status.position_mm) == (StageState.IDLE, (-1.0, -1.0))
+    assert homed.position_at(homed.clock.now_ns()) == (-1.0, -1.0)
+
+
+def test_a_missing_switch_is_named_with_its_remedy(peer: GrblPeer, stage: GrblStage) -> None:
+    peer.faults.switch_missing = True
+    with pytest.raises(DeviceRefused, match=r"switch was not found while homing .*ALARM:9.*wiring"):
+        stage.home(10.0)
+    status = stage.status()
+    assert status.state is StageState.ALARM
+    assert "umbra stage home" in status.detail
+    with pytest.raises(DeviceRefused, match="ALARM:9"):
+        stage.check()
+    peer.faults.switch_missing = False
+    stage.home(10.0)
+    assert stage.status().state is StageState.IDLE
+    stage.check()
+
+
+def test_homing_has_a_deadline_of_its_own(peer: GrblPeer, stage: GrblStage) -> None:
+    peer.faults.homing_s = 60.0
+    with pytest.raises(DeviceTimeout, match=r"did not end within 0\.5 s"):
+        stage.home(0.5)
+    assert stage.status().state is StageState.ALARM
+    peer.faults.homing_s = 0.1
+    stage.home(10.0)
+
+
+def test_halt_ends_homing(peer: GrblPeer, stage: GrblStage) -> None:
+    peer.faults.homing_s = 60.0
+    timer = threading.Timer(0.2, stage.halt)
+    timer.start()
+    with pytest.raises(DeviceError, match="halt"):
+        stage.home(120.0)
+    timer.join()
+    assert stage.status().state is not StageState.HOMING
+    assert peer.state != "Home"
+    peer.faults.homing_s = 0.1
+    stage.home(10.0)
+
+
+def test_homing_switched_off_says_what_to_do(tmp_path: Path) -> None:
+    made = Settings(homing=False)
+    with GrblPeer(tmp_path, resets_on_open=False, settings=made) as peer:
+        stage = make(peer)
+        stage.connect()
+        with pytest.raises(DeviceRefused, match=r"\$22=1"):
+            stage.home(5.0)
+        stage.close()
+
+
+def test_homing_here_makes_the_present_place_the_origin(tmp_path: Path) -> None:
+    made = Settings(homing=False, soft_limits=False, work_positions=True, inches=True)
+    with GrblPeer(tmp_path, resets_on_open=False, settings=made, speed=2) as peer:
+        peer.x, peer.y = 7.0, -2.0
+        stage = make(peer, homing="here", travel_mm=[[-5, 5], [-5, 5]])
+        stage.connect()
+        stage.home(5.0)
+        assert stage.status().position_mm == pytest.approx((0.0, 0.0), abs=0.005)
+        stage.move(3.0, 1.0, FEED)
+        pump_until(stage, at_rest)
+        assert (peer.x, peer.y) == pytest.approx((10.0, -1.0), abs=0.005)
+        with pytest.raises(DeviceRefused, match=r"x = 5\.1 mm"):
+            stage.move(5.1, 0.0, FEED)
+        stage.close()
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [
+        (lambda s: s.move(0.5, -5, FEED), "x = 0.5 mm is outside -40 to 0 mm"),
+        (lambda s: s.move(-5, -41, FEED), "y = -41 mm"),
+        (lambda s: s.move(math.nan, -5, FEED), "x = nan"),
+        (lambda s: s.move(-5, -math.inf, FEED), "y = -inf"),
+        (lambda s: s.circle((-1.0, -10.0), 1.5, FEED, 0.1), "x = 0.5 mm"),
+        (lambda s: s.circle((-10.0, -39.0), 1.5, FEED, 1), "y = -40.5 mm"),
+        (lambda s: s.circle(CENTRE, -1.0, FEED, 1), "radius"),
+        (lambda s: s.circle(CENTRE, math.nan, FEED, 1), "radius"),
+        (lambda s: s.circle(CENTRE, 1.0, FEED, 0), "turns"),
+        (lambda s: s.circle(CENTRE, 1.0, FEED, math.nan), "turns"),
+        (lambda s: s.move(-5, -5, 0.0), "feed"),
+        (lambda s: s.move(-5, -5, 51.0), "takes up to 50 mm/s"),
+        (lambda s: s.jog(1, 1, 10.0), "x = 1 mm"),
+    ],
+)
+def test_limits_are_checked_before_anything_is_sent(
+    peer: GrblPeer, homed: GrblStage, motion: Callable[[GrblStage], None], words: str
+) -> None:
+    sent = list(peer.lines)
+    with pytest.raises(DeviceRefused, match=words):
+        motion(homed)
+    assert peer.lines == sent
+
+
+# ---------------------------------------------------------------- motion
+
+
+def test_move_goes_there_and_says_when(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.move(-12.5, -7.25, FEED)
+    assert homed.status().state is StageState.MOVING
+    status = pump_until(homed, at_rest)
+    assert status.position_mm == pytest.approx((-12.5, -7.25), abs=0.002)
+    assert (peer.x, peer.y) == pytest.approx((-12.5, -7.25), abs=1e-3)
+
+
+def test_status_alone_sees_the_end_of_a_move(homed: GrblStage) -> None:
+    homed.move(-5.0, -5.0, FEED)
+    end = time.monotonic() + 10
+    while (status := homed.status()).state is StageState.MOVING and time.monotonic() < end:
+        time.sleep(0.01)
+    assert status.state is StageState.IDLE
+    assert status.position_mm == pytest.approx((-5.0, -5.0), abs=0.002)
+
+
+def test_circles_keep_the_planner_full_and_never_overflow(tmp_path: Path) -> None:
+    made = Settings(work_positions=True)  # and so an offset that arcs must not depend on
+    with GrblPeer(tmp_path, resets_on_open=False, speed=4, settings=made) as peer:
+        stage = make(peer)
+        stage.connect()
+        stage.home(10.0)
+        stage.circle(CENTRE, 1.5, 25.0, 8.25)
+        pump_until(stage, at_rest)
+        assert peer.overflowed == 0
+        assert peer.starved == 0
+        assert 64 < peer.most_buffered <= 127
+        assert (peer.x, peer.y) == pytest.approx((-10.0, -8.5), abs=0.01)
+        arcs = [line for line in peer.lines if "G3" in line]
+        assert len(arcs) == 9
+        radii = [math.dist((x, y), CENTRE) for _, x, y in peer.path]
+        round_it = radii[next(k for k, r in enumerate(radii) if r < 1.51) :]
+        assert min(round_it) > 1.49
+        assert max(round_it) < 1.51
+        stage.close()
+
+
+def test_position_at_follows_the_circle_and_not_its_chords(tmp_path: Path) -> None:
+    with GrblPeer(tmp_path, resets_on_open=False, speed=2) as peer:
+        clock = ScaledClock(2)
+        real = time.monotonic_ns()
+        skew = clock.now_ns() - 2 * real  # the clock at a moment of the peer's own
+        stage = make(peer, clock, poll_hz=10.0)
+        stage.connect()
+        stage.home(10.0)
+        stage.circle(CENTRE, 1.5, 25.0, math.inf)
+        pump_until(stage, lambda s: len(peer.path) > 800)
+        errors, radii = [], []
+        for seconds, x, y in peer.path[300:700:7]:
+            at = stage.position_at(round(seconds * NS) * 2 + skew)
+            assert at is not None
+            errors.append(math.dist(at, (x, y)))
+            radii.append(math.dist(at, CENTRE))
+        stage.stop()
+        stage.close()
+        assert all(abs(r - 1.5) < 1e-6 for r in radii)  # a chord would be down to .9 mm
+        assert statistics.median(errors) < 0.5  # the rest is the machine's scheduling: 25 mm/s τ
+
+
+def test_moves_queue_up_behind_each_other(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.move(-5.0, -5.0, FEED)
+    homed.move(-5.0, -8.0, FEED)
+    homed.circle((-10.0, -8.0), 2.0, FEED, 1)
+    pump_until(homed, at_rest)
+    assert (peer.x, peer.y) == pytest.approx((-8.0, -8.0), abs=0.002)
+
+
+def test_hold_and_resume(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.circle(CENTRE, 1.5, 25.0, 4)
+    pump_until(homed, moving)
+    homed.hold()
+    assert peer.state == "Hold"
+    held = homed.status()
+    assert held.state is StageState.HELD
+    assert held.position_mm is not None
+    assert math.dist(held.position_mm, (peer.x, peer.y)) < 0.002
+    assert homed.position_at(homed.clock.now_ns()) == held.position_mm
+    homed.hold()
+    with pytest.raises(DeviceRefused, match="held"):
+        homed.move(-5.0, -5.0, FEED)
+    homed.resume()
+    pump_until(homed, at_rest)
+    assert (peer.x, peer.y) == pytest.approx((-8.5, -10.0), abs=0.002)
+
+
+def test_stop_ends_an_endless_circle_and_keeps_the_position(
+    peer: GrblPeer, homed: GrblStage
+) -> None:
+    homed.circle(CENTRE, 1.5, 25.0, math.inf)
+    pump_until(homed, lambda s: len(peer.path) > 200)
+    homed.stop()
+    status = homed.status()
+    assert status.state is StageState.IDLE
+    assert status.position_mm == pytest.approx((peer.x, peer.y), abs=0.002)
+    count = len([line for line in peer.lines if "G3" in line])
+    homed.move(-5.0, -5.0, FEED)  # and the modes are right after the reset
+    pump_until(homed, at_rest)
+    assert (peer.x, peer.y) == pytest.approx((-5.0, -5.0), abs=0.002)
+    assert len([line for line in peer.lines if "G3" in line]) == count
+    homed.stop()
+    homed.stop()
+
+
+def test_jog_is_cancelled_by_stop_and_by_hold(peer: GrblPeer, homed: GrblStage) -> None:
+    for end in (homed.stop, homed.hold):
+        homed.jog(-35.0 if end == homed.stop else -5.0, -20.0, 10.0)
+        pump_until(homed, moving)
+        end()
+        assert peer.state == "Idle"
+        assert homed.status().state is StageState.IDLE
+        assert homed.status().position_mm == pytest.approx((peer.x, peer.y), abs=0.002)
+
+
+def test_halt_from_another_thread_holds_at_once(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.circle(CENTRE, 1.5, 25.0, math.inf)
+    pump_until(homed, moving)
+    thread = threading.Thread(target=homed.halt)
+    thread.start()
+    thread.join()
+    assert pump_until(homed, lambda s: s.state is StageState.HELD)
+    homed.safe()
+    assert homed.status().state is StageState.IDLE
+    assert homed.status().position_mm == pytest.approx((peer.x, peer.y), abs=0.002)
+    homed.halt()  # at rest, too
+    assert pump_until(homed, lambda s: s.state is StageState.HELD)
+    homed.move(-5.0, -5.0, FEED)  # nothing was left to resume, so it may move on
+    pump_until(homed, at_rest)
+
+
+# ---------------------------------------------------------------- things that go wrong
+
+
+def test_dropped_reports_are_asked_for_again(peer: GrblPeer, homed: GrblStage) -> None:
+    peer.faults.drop_reports = 2
+    assert homed.status().state is StageState.IDLE
+    peer.faults.drop_every = 3
+    homed.circle(CENTRE, 1.5, FEED, 3)
+    pump_until(homed, at_rest)
+
+
+def test_silence_is_a_timeout_not_a_hang(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.circle(CENTRE, 1.5, FEED, math.inf)
+    pump_until(homed, moving)
+    peer.faults.mute = True
+    with pytest.raises(DeviceTimeout, match="no status report"):
+        pump_until(homed, lambda s: False)
+    for call in (homed.status, homed.safe, homed.resume):
+        with pytest.raises(DeviceTimeout):
+            call()
+
+
+def test_an_unacknowledged_move_is_not_sent_again(peer: GrblPeer, homed: GrblStage) -> None:
+    peer.faults.swallow_acks = 1
+    with pytest.raises(DeviceError):
+        homed.move(-5.0, -5.0, FEED)
+    assert len([line for line in peer.lines if line.startswith("G53G1X-5")]) == 1
+
+
+def test_a_lost_acknowledgement_ends_in_unknown(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.circle(CENTRE, 1.5, FEED, 3)
+    peer.faults.swallow_acks = 1
+    with pytest.raises(DeviceGarbled, match="acknowledgement was lost"):
+        pump_until(homed, lambda s: False)
+    assert homed.status().state is StageState.UNKNOWN
+    with pytest.raises(DeviceRefused, match="home"):
+        homed.move(-5.0, -5.0, FEED)
+    homed.home(10.0)
+    assert homed.status().state is StageState.IDLE
+
+
+def test_noise_on_the_line_is_counted_and_survived(peer: GrblPeer, homed: GrblStage) -> None:
+    rng = random.Random(4)
+    lines = [
+        b"\xff\x00\x81garbage\r\n", b"<Idle|MPos:nan,1,2>\r\n", b"<Run|MPos:1,2\r\n",
+        b"error:\r\n", b"error:x9\r\n", b"ALARM:\r\n", b"<>\r\n", b"<Idle>\r\n", b"\r\n" * 50,
+        b"<Idle|MPos:1e300,0,0|FS:1>\r\n", b"[VER:\r\n", b"$110=fast\r\n", bytes(3000) + b"\n",
+        *(rng.randbytes(200).replace(b"\n", b"") + b"\r\n" for _ in range(40)),
+    ]  # fmt: skip
+    peer.faults.noise.extend(lines)
+    homed.circle(CENTRE, 1.5, FEED, 3)
+    pump_until(homed, at_rest)
+    assert not peer.faults.noise
+    assert homed.status().position_mm == pytest.approx((-8.5, -10.0), abs=0.002)
+    assert homed.facts()["garbled_lines"] > 20
+
+
+def test_a_refused_line_stops_the_stream_by_its_name(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.move(-11.0, -10.0, FEED)
+    pump_until(homed, at_rest)
+    homed.circle(CENTRE, 1.5, 25.0, math.inf)
+    pump_until(homed, moving)
+    peer.faults.refuse["G3"] = 33
+    with pytest.raises(DeviceRefused, match=r"impossible \(error:33\)"):
+        pump_until(homed, lambda s: False)
+    assert peer.state == "Idle"
+    assert homed.status().position_mm == pytest.approx((peer.x, peer.y), abs=0.002)
+
+
+def test_a_first_line_that_is_refused_is_heard_in_the_call(
+    peer: GrblPeer, homed: GrblStage
+) -> None:
+    peer.faults.refuse["G53G1"] = 20
+    with pytest.raises(DeviceRefused, match="unsupported"):
+        homed.move(-5.0, -5.0, FEED)
+
+
+def test_a_hard_limit_blocks_until_unlocked_and_loses_the_position(
+    peer: GrblPeer, homed: GrblStage
+) -> None:
+    peer.faults.hard_limit_at = -8.0
+    homed.move(-20.0, -5.0, FEED)
+    with pytest.raises(DeviceRefused, match=r"limit switch was hit in motion \(ALARM:1\)"):
+        pump_until(homed, lambda s: False)
+    status = homed.status()  # which it does not answer: known without asking
+    assert (status.state, status.position_mm) == (StageState.ALARM, None)
+    assert homed.position_at(homed.clock.now_ns()) is None
+    homed.safe()
+    with pytest.raises(DeviceRefused, match="ALARM:1"):
+        homed.move(-5.0, -5.0, FEED)
+    peer.faults.hard_limit_at = None
+    homed.unlock()
+    assert homed.status().state is StageState.UNKNOWN
+    homed.home(10.0)
+    assert homed.status().state is StageState.IDLE
+
+
+def beyond(stage: GrblStage) -> None:
+    stage.move(-60.0, -5.0, FEED)
+    pump_until(stage, lambda s: False)
+
+
+def test_the_controllers_own_soft_limit_is_a_named_alarm(tmp_path: Path) -> None:
+    with GrblPeer(tmp_path, resets_on_open=False, speed=2) as peer:
+        stage = make(peer, travel_mm=[[-100, 0], [-100, 0]])  # more than the controller's 40
+        stage.connect()
+        stage.home(10.0)
+        with pytest.raises(DeviceRefused, match=r"ALARM:2.*\$130"):
+            beyond(stage)
+        stage.home(10.0)
+        assert stage.status().state is StageState.IDLE
+        stage.close()
+
+
+def test_a_reset_behind_its_back_is_a_loss(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.circle(CENTRE, 1.5, FEED, math.inf)
+    pump_until(homed, moving)
+    peer.power_cycle()
+    with pytest.raises(DeviceLost, match="was reset"):
+        pump_until(homed, lambda s: False)
+    with pytest.raises(DeviceLost, match="was reset"):
+        homed.status()
+    assert homed.position_at(homed.clock.now_ns()) is None
+    homed.connect()
+    assert homed.status().state is StageState.UNKNOWN
+    with pytest.raises(DeviceRefused, match="home"):
+        homed.move(-5.0, -5.0, FEED)
+
+
+def test_pulled_and_back_under_another_name(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.circle(CENTRE, 1.5, FEED, math.inf)
+    pump_until(homed, moving)
+    before = peer.name
+    peer.unplug()
+    with pytest.raises(DeviceLost):
+        pump_until(homed, lambda s: False)
+    assert homed.position_at(homed.clock.now_ns()) is None
+    homed.halt()
+    with pytest.raises(DeviceLost):
+        homed.connect()
+    assert homed.position_at(homed.clock.now_ns()) is None
+    peer.plug()
+    assert peer.name != before
+    homed.connect()
+    assert homed.status().state is StageState.UNKNOWN
+    count = len(peer.lines)
+    with pytest.raises(DeviceRefused, match="home"):
+        homed.circle(CENTRE, 1.5, FEED, 1)
+    assert len(peer.lines) == count
+    homed.home(10.0)
+    homed.move(-5.0, -5.0, FEED)
+    pump_until(homed, at_rest)
+
+
+def test_pulled_while_homing(peer: GrblPeer, stage: GrblStage) -> None:
+    peer.faults.homing_s = 60.0
+    timer = threading.Timer(0.2, peer.unplug)
+    timer.start()
+    with pytest.raises(DeviceLost):
+        stage.home(120.0)
+    timer.join()
+
+
+def test_another_controller_in_its_place_is_refused(tmp_path: Path) -> None:
+    with GrblPeer(tmp_path, resets_on_open=False, settings=Settings(label="one")) as peer:
+        stage = make(peer)
+        stage.connect()
+        stage.close()
+        peer.settings.label = "two"
+        with pytest.raises(DeviceRefused, match=r"another controller \(two\)"):
+            stage.connect()
+
+
+# ---------------------------------------------------------------- what it says
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.text(max_size=60))
+def test_no_line_makes_the_parsers_raise(text: str) -> None:
+    for line in (text, f"<{text}>", f"<Idle|{text}>", f"<Idle|MPos:{text}>", f"[OPT:{text}]"):
+        grbl.parse_report(line)
+        grbl.parse_banner(line)
+        grbl.parse_build([line, f"[VER:{text}]"])
+        grbl.parse_settings([line, f"${text}", f"$110={text}"])
+
+
+def test_a_report_is_read_in_full() -> None:
+    report = grbl.parse_report(
+        "<Hold:1|WPos:1.000,-2.000,0.000|Bf:15,128|FS:1500,0|Pn:XYP|WCO:-5.000,3.000,0.000>"
+    )
+    assert report is not None
+    assert (report.state, report.substate, report.pins) == ("Hold", 1, "XYP")
+    assert report.position == (-4.0, 1.0)
+    assert report.speed == 25.0
+    later = grbl.parse_report("<Idle|WPos:0,0,0>", offset=report.offset)
+    assert later is not None
+    assert later.position == (-5.0, 3.0)
+    inches = grbl.parse_report("<Run|MPos:1.0000,0.0000,0.0000|F:60.0>", scale=25.4)
+    assert inches is not None
+    assert inches.position == (25.4, 0.0)
+    assert inches.speed == 25.4
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["<Idle>", "<Idle|MPos:>", "<Idle|MPos:1>", "<Nap|MPos:1,2,3>", "<Idle|MPos:1_0,2,3>",
+     "<Hold:x|MPos:1,2,3>", "Idle|MPos:1,2,3", "<Idle|MPos:inf,2,3>", "<Idle|WPos:1,2,3|WCO:a>"],
+)  # fmt: skip
+def test_a_damaged_report_is_none(line: str) -> None:
+    assert grbl.parse_report(line) is None
+
+
+def test_every_documented_alarm_and_error_has_words_and_a_remedy() -> None:
+    for code in range(1, 11):
+        words, remedy = grbl.alarm(code)
+        assert f"ALARM:{code}" in words
+        assert remedy
+    for code in [*range(1, 18), *range(20, 39)]:
+        words, remedy = grbl.refusal(code)
+        assert f"error:{code}" in words
+        assert "refused" not in words
+        assert remedy
+
+
+def test_the_clock_is_the_contexts(peer: GrblPeer) -> None:
+    clock = RealClock()
+    stage = make(peer, clock)
+    stage.connect()
+    before = clock.now_ns()
+    assert before <= stage.status().at_ns <= clock.now_ns()
+    stage.close()
