@@ -5,6 +5,11 @@ from protocol.client import Client, connect
 from protocol.errors import Code, UmbraError
 from protocol.patterns import BLACK, WHITE, Checker, Solid
 from protocol.scans import (
+    CalibrateDark,
+    CalibrateLatency,
+    CalibrateLeak,
+    CalibrateNoise,
+    CalibrateTone,
     Checkerboard,
     GrayCode,
     Mesh,
@@ -22,6 +27,11 @@ __all__ = [
     "BLACK",
     "WHITE",
     "AsyncClient",
+    "CalibrateDark",
+    "CalibrateLatency",
+    "CalibrateLeak",
+    "CalibrateNoise",
+    "CalibrateTone",
     "Checker",
     "Checkerboard",
     "Client",
@@ -39,4 +49,4 @@ __all__ = [
     "TwoImage",
     "UmbraError",
     "connect",
-]  # fmt: skip
+]

@@ -124,7 +124,7 @@ class _Daemon:
 
             rig = Rig(self._config, lambda info: publish(DeviceChanged(device=info)))
             viewfinder = Viewfinder(glimpsed)
-            manual = Manual(rig, viewfinder, changed)
+            manual = Manual(rig, viewfinder, changed, publish)
             runner = Runner(
                 rig=rig,
                 store=store,

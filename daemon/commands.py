@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from daemon import __version__, picture, products
+from daemon import __version__, discovery, measured, picture, products
 from daemon.config import RigConfig
 from daemon.logs import LogBook
 from daemon.manual import Manual
@@ -18,7 +18,7 @@ from daemon.publisher import Publisher
 from daemon.rig import SAFE_S, Rig
 from daemon.runner import LOCK, Runner
 from daemon.scans import catalog
-from daemon.separation.estimator import Components
+from daemon.separation.estimator import Components, Result
 from daemon.server import Answer, Caller
 from daemon.store import RunFolder, Store
 from daemon.viewfinder import Viewfinder, facts_of
@@ -62,6 +62,7 @@ class Commands:
             m.Hello: self._hello,
             m.GetStatus: self._status,
             m.GetDevices: self._devices,
+            m.Discover: self._discover,
             m.Submit: self._submit,
             m.GetQueue: self._queue,
             m.MoveQueued: self._move,
@@ -80,6 +81,12 @@ class Commands:
             m.Snap: self._snap,
             m.SetCamera: self._camera,
             m.SetLight: self._light,
+            m.GetStage: self._stage,
+            m.StageHome: self._stage_home,
+            m.StageMove: self._stage_move,
+            m.StageCircle: self._stage_circle,
+            m.StageStop: self._stage_stop,
+            m.StageUnlock: self._stage_unlock,
             m.Dark: self._dark,
             m.Lock: self._lock,
             m.RenewLock: self._renew,
@@ -142,6 +149,14 @@ class Commands:
 
     async def _devices(self, _: m.GetDevices, __: _Asked) -> Answer:
         return Answer(m.Devices(devices=self._rig.devices()))
+
+    async def _discover(self, command: m.Discover, asked: _Asked) -> Answer:
+        self._manual.admit(asked.token)
+        self._require_no_run()
+        searches = await discovery.discover(
+            command.drivers, command.timeout_s, self._config.devices, self._rig.devices()
+        )
+        return Answer(m.Discovered(searches=searches))
 
     async def _log(self, command: m.GetLog, _: _Asked) -> Answer:
         return Answer(m.Log(records=self._book.records(command.run, command.limit)))
@@ -222,25 +237,25 @@ class Commands:
     async def _result(self, command: m.GetResult, _: _Asked) -> Answer:
         def result() -> Answer:
             run = self._runner.find(command.run)
-            components, facts = self._components(run)
+            found, facts = self._result_of(run)
+            reply = m.Result(run=run.info(), final=run.file.state is m.RunState.DONE, facts=facts)
+            if not isinstance(found, Components):
+                return Answer(reply)
             return Answer(
-                m.Result(run=run.info(), final=run.file.state is m.RunState.DONE, facts=facts),
-                {
-                    "direct": components.direct,
-                    "global": components.global_,
-                    "quality": components.quality,
-                },
+                reply,
+                {"direct": found.direct, "global": found.global_, "quality": found.quality},
             )
 
         return await asyncio.to_thread(result)
 
-    def _components(self, run: RunFolder) -> tuple[Components, dict[str, Any]]:
+    def _result_of(self, run: RunFolder) -> tuple[Result, dict[str, Any]]:
         """Of a run under way: so far; of one that has ended: as its products have it."""
         course = self._runner.course
         if course is not None and course.folder.id == run.id and not run.file.products:
-            components = course.result()
-            return components, components.facts
-        return products.read(run)
+            found = course.result()
+            return found, found.facts
+        measurement = measured.read(run)
+        return (measurement, measurement.facts) if measurement else products.read(run)
 
     async def _product(self, command: m.GetProduct, _: _Asked) -> Answer:
         def part() -> Answer:
@@ -270,7 +285,11 @@ class Commands:
                     m.Picture(facts={**glimpse.facts, "run": glimpse.run}), {"preview": small}
                 )
             run = self._runner.find("")
-            components, _ = self._components(run)
+            components, _ = self._result_of(run)
+            if not isinstance(components, Components):
+                raise UmbraError(
+                    Code.NO_RESULT, f"{run.id} measures: it has figures, no {command.what}"
+                )
             plane = components.direct if command.what == "direct" else components.global_
             shown = picture.component(plane, command.width)
             return Answer(
@@ -285,13 +304,16 @@ class Commands:
         self._manual.admit(asked.token)
         if self._estopped:
             raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
+        self._require_no_run()
+        return await asyncio.to_thread(act)
+
+    def _require_no_run(self) -> None:
         current = self._runner.current
         if current is not None:
             raise UmbraError(
                 Code.BUSY,
                 f"{current.id} is using the devices; wait for it, or `umbra abort`",
             )
-        return await asyncio.to_thread(act)
 
     async def _show(self, command: m.Show, asked: _Asked) -> Answer:
         await self._by_hand(asked, lambda: self._manual.show(command.pattern, command.lease_s))
@@ -321,6 +343,35 @@ class Commands:
     async def _light(self, command: m.SetLight, asked: _Asked) -> Answer:
         await self._by_hand(asked, lambda: self._manual.light(command.name, command.on))
         return Answer(m.Done(message=f"{command.name} is {'on' if command.on else 'off'}"))
+
+    async def _stage(self, _: m.GetStage, __: _Asked) -> Answer:
+        return Answer(await asyncio.to_thread(self._manual.stage.status))
+
+    async def _stage_home(self, command: m.StageHome, asked: _Asked) -> Answer:
+        home = self._manual.stage.home
+        return Answer(await self._by_hand(asked, lambda: home(command.timeout_s)))
+
+    async def _stage_move(self, command: m.StageMove, asked: _Asked) -> Answer:
+        def move() -> m.StageStatus:
+            return self._manual.stage.move(command.x_mm, command.y_mm, command.feed_mm_s)
+
+        return Answer(await self._by_hand(asked, move))
+
+    async def _stage_circle(self, command: m.StageCircle, asked: _Asked) -> Answer:
+        def circle() -> m.StageStatus:
+            return self._manual.stage.circle(
+                command.centre_mm, command.radius_mm, command.feed_mm_s, command.turns
+            )
+
+        return Answer(await self._by_hand(asked, circle))
+
+    async def _stage_stop(self, _: m.StageStop, __: _Asked) -> Answer:
+        """Whoever holds the rig: to stop is never refused, but a run is aborted, not stopped."""
+        self._require_no_run()
+        return Answer(await asyncio.to_thread(self._manual.stage.stop))
+
+    async def _stage_unlock(self, _: m.StageUnlock, asked: _Asked) -> Answer:
+        return Answer(await self._by_hand(asked, self._manual.stage.unlock))
 
     async def _dark(self, _: m.Dark, asked: _Asked) -> Answer:
         await self._by_hand(asked, self._manual.end)

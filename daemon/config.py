@@ -64,6 +64,12 @@ class SequencerSection(_Section, frozen=True, kw_only=True):
     frame_timeout_s: Annotated[float, Meta(gt=0)] = 2.0  # beyond exposure and readout
 
 
+class CalibrationSection(_Section, frozen=True, kw_only=True):
+    """[calibration]: for how long one is believed."""
+
+    max_age_days: Annotated[float, Meta(gt=0)] = 90.0  # older ones are not applied
+
+
 class DeviceTable(_Section, frozen=True, kw_only=True):
     """A device: its driver, and that driver's own keys (validated by it)."""
 
@@ -80,6 +86,7 @@ class RigConfig(_Section, frozen=True, kw_only=True):
     network: NetworkSection
     storage: StorageSection
     sequencer: SequencerSection
+    calibration: CalibrationSection
     devices: tuple[DeviceTable, ...]
 
     def device(self, kind: str) -> DeviceTable | None:
@@ -94,6 +101,7 @@ class _File(_Section, frozen=True, kw_only=True):
     network: NetworkSection = NetworkSection()
     storage: StorageSection = StorageSection()
     sequencer: SequencerSection = SequencerSection()
+    calibration: CalibrationSection = CalibrationSection()
     camera: dict[str, Any] | None = None
     projector: dict[str, Any] | None = None
     stage: dict[str, Any] | None = None
@@ -143,6 +151,7 @@ def parse(text: str, origin: str) -> RigConfig:
         network=file.network,
         storage=file.storage,
         sequencer=file.sequencer,
+        calibration=file.calibration,
         devices=tuple(devices),
     )
 

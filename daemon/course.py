@@ -17,6 +17,7 @@ from typing import Any
 import structlog
 
 from daemon import products
+from daemon.calibration import Calibrations
 from daemon.config import RigConfig
 from daemon.control import Control
 from daemon.devicethread import Revoked, Session
@@ -27,7 +28,7 @@ from daemon.rig import SAFE_S, Rig
 from daemon.ring import Ring
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Method
-from daemon.separation.estimator import Components, NotYet
+from daemon.separation.estimator import NotYet, Result
 from daemon.sequencer import CALL_S, Behind, Sequencer
 from daemon.store import RunFolder, Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
@@ -35,7 +36,7 @@ from drivers.base import CameraInfo, CameraSettings, DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
 from protocol.messages import End, Progress, RunState
-from protocol.scans import Scan
+from protocol.scans import Spec
 
 _PROGRESS_S = 0.1
 _ROOM_S = 1.0
@@ -109,8 +110,8 @@ class Course:
             summary=summary,
         )
 
-    def result(self) -> Components:
-        """Components from the frames so far. Raises UmbraError(no_result)."""
+    def result(self) -> Result:
+        """The result from the frames so far. Raises UmbraError(no_result)."""
         recorder = self._recorder
         if recorder is None:
             raise UmbraError(Code.NO_RESULT, f"{self.folder.id} has no frames yet")
@@ -169,7 +170,11 @@ class Course:
         if resuming:
             self._same_devices(file.rig)
         settings = self._configure(session, file.spec, file.rig if resuming else None)
-        bench = self._rig.bench()
+        calibration = file.calibration if resuming else None
+        if calibration is None:
+            found = Calibrations(self._store, self._config.calibration.max_age_days)
+            calibration = found.of(self._rig.snapshot(), settings, file.spec)
+        bench = self._rig.bench(calibration["values"])
         method = self._method = method_for(file.spec, bench)
         info = bench.camera
         self._room(method.planned(), info)
@@ -180,6 +185,7 @@ class Course:
             end=None,
             planned=method.planned(),
             rig={**self._rig.snapshot(), "settings": settings},
+            calibration=calibration,
         )
         frames = self._frames(info, resuming)
         try:
@@ -233,7 +239,7 @@ class Course:
     # ------------------------------------------------------------ before
 
     def _configure(
-        self, session: Session, spec: Scan, before: Mapping[str, Any] | None
+        self, session: Session, spec: Spec, before: Mapping[str, Any] | None
     ) -> dict[str, Any]:
         """Set the camera as the spec asks, or exactly as it was before an interruption."""
         wanted = CameraSettings(exposure_us=spec.exposure_us, gain=spec.gain)
@@ -242,7 +248,11 @@ class Course:
         camera = self._rig.camera
         in_force = camera.call(lambda c: c.configure(wanted), CALL_S, session)
         self._exposure_s = (in_force.exposure_us or 0.0) * 1e-6
-        return {"exposure_us": in_force.exposure_us, "gain": in_force.gain}
+        return {
+            "exposure_us": in_force.exposure_us,
+            "gain": in_force.gain,
+            "pixel_format": camera.device.info().pixel_format.value,
+        }
 
     def _same_devices(self, before: Mapping[str, Any]) -> None:
         """An interrupted run goes on with the devices that it began with, or not at all."""
@@ -342,12 +352,12 @@ class Course:
         self._update(state=RunState.FINISHING)
         self._say("writing products")
         began = time.monotonic()
-        components = recorder.result(_RESULT_S)
+        result = recorder.result(_RESULT_S)
         self._timings["separate_s"] = time.monotonic() - began
         lost = recorder.lost_patterns
         made = products.write(
             self.folder,
-            components,
+            result,
             full_scale=info.pixel_format.full_scale,
             pixel_format=info.pixel_format,
             frame=self._viewfinder.picture(),

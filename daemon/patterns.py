@@ -6,6 +6,7 @@ to the right and downwards.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import tau
 
 import numpy as np
@@ -43,6 +44,11 @@ def render(pattern: AnyPattern, width: int, height: int) -> NDArray[np.uint8]:
         case _:
             lit = np.broadcast_to(_lit(pattern, width, height), (height, width))
             return np.where(lit, np.uint8(LEVELS), np.uint8(0))
+
+
+def predistorted(image: NDArray[np.uint8], tone: Sequence[int]) -> NDArray[np.uint8]:
+    """An image of wanted light as the levels that give it; `tone`: the level for each of 256."""
+    return np.take(np.asarray(tone, dtype=np.uint8), image)
 
 
 def lit_fraction(pattern: AnyPattern, width: int, height: int) -> float:

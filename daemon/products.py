@@ -1,5 +1,7 @@
 """What a separation leaves for people and programs: images, masks, figures, pictures, a report.
 
+What a measurement leaves is in `daemon.measured`.
+
     direct.tiff, global.tiff   float32, linear counts in the input's full scale, RGB; NaN: unknown
     PLANE.tiff                 further planes of the method
     truth_*.tiff               of a simulated camera
@@ -13,8 +15,6 @@ finds a whole file or none.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,28 +24,28 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon import report
+from daemon import measured, report
 from daemon.display import Picture, common_white, for_display, frame_light
-from daemon.durable import Damaged, fsync_file, fsync_folder, storage
+from daemon.durable import Damaged
 from daemon.frames import FrameRecord, FrameStore, NoPixels
 from daemon.preview import side_by_side
 from daemon.quality import BITS, overlay
-from daemon.separation.estimator import Components, Lighting
+from daemon.separation.estimator import Components, Lighting, Measurement, Result
 from daemon.separation.single import block_mean
+from daemon.staging import Staging, as_json, encoded, tiff
 from daemon.store import RunFolder
 from drivers.base import PixelFormat
 from protocol.errors import Code, UmbraError
 from protocol.messages import Product
+from protocol.scans import Scan
 
 PREVIEW_WIDTH = 640
 REPORT_WIDTH = 1440
 
-_STAGING = ".products-"
-
 
 def write(
     folder: RunFolder,
-    components: Components,
+    result: Result,
     *,
     full_scale: float,
     pixel_format: PixelFormat | None = None,
@@ -53,17 +53,23 @@ def write(
     truth: Mapping[str, NDArray[np.float32]] | None = None,
     timings: Mapping[str, float] | None = None,
 ) -> tuple[Product, ...]:
-    """Write all products of a separation, durably; earlier ones of the same names are replaced.
+    """Write all products of a result, durably; earlier ones of the same names are replaced.
 
     `full_scale` is the camera's. The frame to be shown is read from the run when `pixel_format`
     says how; `frame`, an sRGB picture, stands in for it. `truth` are a simulated camera's `direct`
     and `global`. Raises StorageError; then the run has the products that it had.
     """
     file = folder.file
-    facts = quality_facts(components, full_scale, truth)
     records = _records(folder.path)
+    if isinstance(result, Measurement):
+        return measured.write(folder, result, records=records, timings=timings)
+    components = result
+    facts = quality_facts(components, full_scale, truth)
+    if file.calibration:
+        facts["calibration"] = file.calibration
+    tone = file.spec.radiometry.tone if isinstance(file.spec, Scan) else "linear"
     white = min(common_white(_sum(components)), full_scale)
-    shown = _frame_light(folder.path, records, pixel_format, file.spec.radiometry.tone)
+    shown = _frame_light(folder.path, records, pixel_format, tone)
     pictures = {
         "frame": frame if shown is None else for_display(shown, white),
         "direct": for_display(components.direct, white, width=REPORT_WIDTH),
@@ -71,7 +77,7 @@ def write(
         "quality": overlay(_sum(components), white, components.quality, width=REPORT_WIDTH),
     }
     found = {name: picture for name, picture in pictures.items() if picture is not None}
-    staging = _Staging(folder.path)
+    staging = Staging(folder.path)
     try:
         light = "linear counts"
         staging.add("direct", "image", "direct.tiff", tiff(components.direct), light)
@@ -80,10 +86,10 @@ def write(
             staging.add(name, "image", f"{name}.tiff", tiff(plane))
         for name, plane in (truth or {}).items():
             staging.add(f"truth_{name}", "image", f"truth_{name}.tiff", tiff(plane), light)
-        staging.add("quality", "mask", "quality.png", _encoded(".png", components.quality), "bits")
-        staging.add("facts", "facts", "quality.json", _json(facts))
+        staging.add("quality", "mask", "quality.png", encoded(".png", components.quality), "bits")
+        staging.add("facts", "facts", "quality.json", as_json(facts))
         preview = side_by_side({name: for_preview(picture) for name, picture in found.items()})
-        staging.add("preview", "picture", "preview.png", _encoded(".png", preview[..., ::-1]))
+        staging.add("preview", "picture", "preview.png", encoded(".png", preview[..., ::-1]))
         page = report.render(
             report.Subject(
                 file=file,
@@ -187,13 +193,6 @@ def compare(
     return found
 
 
-def tiff(plane: NDArray[Any]) -> bytes:
-    """A plane (H, W) or (H, W, 3) RGB, float32 or uint16, as an uncompressed TIFF."""
-    # Uncompressed: noise hardly shrinks, and every reader maps it. OpenCV wants BGR, writes RGB.
-    ordered = plane[..., ::-1] if plane.ndim == 3 else plane
-    return _encoded(".tiff", ordered, [cv2.IMWRITE_TIFF_COMPRESSION, 1])
-
-
 def for_preview(picture: Picture) -> Picture:
     """A picture at the preview's size."""
     return _shrunk(picture, PREVIEW_WIDTH)
@@ -205,34 +204,6 @@ def _shrunk(picture: Picture, width: int) -> Picture:
     size = (width, max(1, round(picture.shape[0] * width / picture.shape[1])))
     shrunk = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     return np.asarray(shrunk, dtype=np.uint8)
-
-
-class _Staging:
-    """Files on their way into a run's folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self.products: list[Product] = []
-        self._folder = folder
-        with storage("writing products"):
-            for left in folder.glob(f"{_STAGING}*"):
-                shutil.rmtree(left)
-            self._staging = Path(tempfile.mkdtemp(prefix=_STAGING, dir=folder))
-
-    def add(self, name: str, kind: str, file: str, data: bytes, unit: str = "") -> None:
-        with storage(f"writing {file}"):
-            (self._staging / file).write_bytes(data)
-            fsync_file(self._staging / file)
-        product = Product(name=name, kind=kind, file=file, unit=unit, bytes=len(data))
-        self.products.append(product)
-
-    def publish(self) -> None:
-        with storage("writing products"):
-            for product in self.products:
-                (self._staging / product.file).replace(self._folder / product.file)
-            fsync_folder(self._folder)
-
-    def clear(self) -> None:
-        shutil.rmtree(self._staging, ignore_errors=True)
 
 
 def _records(folder: Path) -> list[FrameRecord]:
@@ -272,13 +243,6 @@ def _rms(difference: NDArray[np.float32]) -> float | None:
     return float(np.sqrt(np.mean(finite**2))) if finite.size else None
 
 
-def _encoded(kind: str, plane: NDArray[Any], options: list[int] | None = None) -> bytes:
-    done, data = cv2.imencode(kind, np.ascontiguousarray(plane), options or [])
-    if not done:
-        raise ValueError(f"{plane.shape} {plane.dtype} cannot be written as {kind}")
-    return data.tobytes()
-
-
 def _decoded(path: Path) -> NDArray[Any]:
     """A plane as `tiff` or quality.png has it, RGB."""
     plane = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -289,13 +253,3 @@ def _decoded(path: Path) -> NDArray[Any]:
 
 def _spoilt(path: Path) -> Damaged:
     return Damaged(f"{path} cannot be read; the run's frames are kept: separate them again")
-
-
-def _json(facts: Mapping[str, Any]) -> bytes:
-    return msgspec.json.format(msgspec.json.encode(facts, enc_hook=_plain)) + b"\n"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} in facts")

@@ -26,7 +26,7 @@ import structlog
 from daemon.frames import FrameRecord, FrameStore
 from daemon.ring import Buffer, Ring
 from daemon.scans.method import Expose, Method, Step, Taken
-from daemon.separation.estimator import Components, NotYet
+from daemon.separation.estimator import Components, NotYet, Result
 from drivers.base import Frame
 from drivers.clock import NS
 
@@ -49,6 +49,7 @@ class Exposed:
     buffer: Buffer | None = None
     missing: str = ""
     stage_mm: tuple[float, float] | None = None
+    lit_ns: int = 0  # from when the light was said to be the step's; 0: not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,10 +101,13 @@ class Recorder:
         self._failure: BaseException | None = None
         self._summary: Mapping[str, float] = {}
         self._tally = Tally()
+        self._handed = 0  # frames put by the sequencer, and of these ...
+        self._taken_in = 0  # ... in the estimator
+        self._changed = threading.Condition()
         self._missing_patterns: set[int] = set()
         self._seen_patterns: set[int] = set()
         self._incoming: queue.Queue[Exposed | None] = queue.Queue(maxsize=ring.count + 1)
-        self._accepted: queue.Queue[tuple[Exposed, FrameRecord] | Future[Components] | None] = (
+        self._accepted: queue.Queue[tuple[Exposed, FrameRecord] | Future[Result] | None] = (
             queue.Queue(maxsize=ring.count + 8)
         )
         self._threads = (
@@ -150,6 +154,7 @@ class Recorder:
                 self._incoming.put(exposed, timeout=_PATIENCE_S)
             except queue.Full:
                 continue
+            self._handed += 1
             return
 
     def check(self) -> None:
@@ -186,14 +191,26 @@ class Recorder:
             thread.join()
         self.check()
 
+    def digested(self, timeout_s: float) -> bool:
+        """Wait until all frames handed over so far are in the estimator; False if they are not
+        after `timeout_s`. Raises what went wrong in a worker."""
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while self._taken_in < self._handed:
+                self.check()
+                if time.monotonic() >= deadline:
+                    return False
+                self._changed.wait(_PATIENCE_S)
+        return True
+
     # ------------------------------------------------------------ for whoever asks
 
-    def result(self, timeout_s: float) -> Components:
-        """Components from the frames taken in so far; from any thread. Raises NotYet."""
+    def result(self, timeout_s: float) -> Result:
+        """The result from the frames taken in so far; from any thread. Raises NotYet."""
         if not self._threads[1].is_alive():
             self.check()
-            return self._method.conclude(self._estimator.result())
-        future: Future[Components] = Future()
+            return self._conclude()
+        future: Future[Result] = Future()
         try:
             self._accepted.put(future, timeout=timeout_s)
             return future.result(timeout_s)
@@ -253,6 +270,8 @@ class Recorder:
                 sub=exposed.sub,
                 incomplete=frame is None or frame.incomplete,
                 source=frame.source if frame else "",
+                delay_us=(frame.start_ns - exposed.lit_ns) / 1e3 if frame and exposed.lit_ns else 0,
+                exposure_us=frame.exposure_us if frame else 0.0,
             ),
         )
         record = FrameRecord(
@@ -302,6 +321,9 @@ class Recorder:
                     tally.rejected + (not record.observation.used),
                 )
             self._summary = self._estimator.summary()
+            with self._changed:
+                self._taken_in += 1
+                self._changed.notify_all()
             self._on_taken(self._tally, self._summary, exposed)
             if exposed.buffer is not None:
                 self._ring.give(exposed.buffer)
@@ -310,8 +332,12 @@ class Recorder:
         if record.observation.used:
             self._seen_patterns.add(record.observation.pattern)
 
-    def _answer(self, future: Future[Components]) -> None:
+    def _conclude(self) -> Result:
+        result = self._estimator.result()
+        return self._method.conclude(result) if isinstance(result, Components) else result
+
+    def _answer(self, future: Future[Result]) -> None:
         try:
-            future.set_result(self._method.conclude(self._estimator.result()))
+            future.set_result(self._conclude())
         except (NotYet, ValueError, ArithmeticError) as error:
             future.set_exception(error)

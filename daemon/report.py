@@ -25,12 +25,19 @@ from protocol.messages import Product
 _ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a line of advice
 _DIM_BELOW = 0.25  # of full scale: a scene that uses less than this is under-exposed
 _MOST_BARS = 240
+_FOOTER = (
+    "Pictures are for eyes: sRGB, all at one scale, clipped. The measurements are in the TIFF "
+    "files: linear, float32, NaN where nothing was measured."
+)
 _TITLES = {
     "frame": "as the camera saw the scene",
     "direct": "light that came straight from the source",
     "global": "light that came by way of the scene",
     "quality": "flagged pixels in colour",
 }
+
+
+Records = Sequence[FrameRecord]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,28 +58,42 @@ class Subject:
 def render(subject: Subject) -> str:
     """The page, as HTML."""
     file = subject.file
-    template = Template(resources.files("daemon").joinpath("report.html").read_text("utf-8"))
-    return template.substitute(
-        title=escape(f"{file.id} · direct and global"),
-        id=escape(file.id),
-        method=escape(_method(file)),
-        note=f'<p class="note">{escape(file.spec.note)}</p>' if file.spec.note else "",
-        who=escape(_who(file)),
-        figures=_figures(subject),
+    body = Template(template("report_separation.html")).substitute(
         advice="".join(f"<li>{escape(line)}</li>" for line in advice(subject)),
         viewer=_viewer(subject),
         legend=_legend(subject.facts),
         histogram=_histogram(subject),
         exposure=escape(_exposure(subject)),
         pace=_pace(subject.records),
-        settings=_table(_settings(subject)),
-        timings=_table(_timings(subject)),
-        missing=_missing(subject.records),
-        rig=_table(_flat(file.rig)),
-        versions=_table(file.versions.items()),
-        facts=_table(_flat(_plain_facts(subject.facts))),
-        files=_files(subject.products),
+        settings=table(_settings(subject)),
+        calibration=calibration(file),
+        timings=table(timed(file, subject.timings)),
+        missing=missing(subject.records),
+        rig=table(flat(file.rig)),
+        versions=table(file.versions.items()),
+        facts=table(flat(_plain_facts(subject.facts))),
+        files=files(subject.products),
     )
+    return page(file, _figures(subject), body, _FOOTER)
+
+
+def page(file: RunFile, figures: str, body: str, footer: str) -> str:
+    """A run's page around its body; `figures` and `body` are HTML."""
+    return Template(template("report.html")).substitute(
+        title=escape(f"{file.id} · Umbra"),
+        id=escape(file.id),
+        method=escape(_method(file)),
+        note=f'<p class="note">{escape(file.spec.note)}</p>' if file.spec.note else "",
+        who=escape(_who(file)),
+        figures=figures,
+        body=body,
+        footer=escape(footer),
+    )
+
+
+def template(name: str) -> str:
+    """A page's template."""
+    return resources.files("daemon").joinpath(name).read_text("utf-8")
 
 
 def advice(subject: Subject) -> list[str]:
@@ -99,6 +120,7 @@ def advice(subject: Subject) -> list[str]:
             f"The scene uses {_percent(top)} of the camera's scale: "
             f"an exposure about {0.8 / top:.0f} times as long would lower the noise."
         )
+    lines += calibration_advice(file)
     return lines or ["Nothing to mend: well exposed, all frames taken, few pixels flagged."]
 
 
@@ -118,7 +140,7 @@ def _method(file: RunFile) -> str:
         case "stick":
             return "Stick: an occluder swept over the scene"
         case other:
-            return str(other).capitalize()
+            return str(other).replace("-", " ").capitalize()
 
 
 def _who(file: RunFile) -> str:
@@ -271,8 +293,37 @@ def _settings(subject: Subject) -> Iterable[tuple[str, Any]]:
     yield "pictures show as white", f"{subject.white:.4g} counts"
 
 
-def _timings(subject: Subject) -> Iterable[tuple[str, str]]:
-    for name, value in {**subject.file.timings, **subject.timings}.items():
+def asked(file: RunFile) -> Iterable[tuple[str, Any]]:
+    """What a run was told."""
+    for key, value in msgspec.to_builtins(file.spec).items():
+        if key not in {"method", "note"} and value is not None:
+            yield key, value
+    yield from file.rig.get("settings", {}).items()
+
+
+def calibration(file: RunFile) -> str:
+    """What calibration was applied, how old it was, and what was left out."""
+    found = file.calibration or {}
+    rows = [
+        (kind, f"{source['run']}, {source['age_days']:.1f} days old")
+        for kind, source in found.get("sources", {}).items()
+    ]
+    rows += [(kind["kind"], f"not applied: {kind['why']}") for kind in found.get("ignored", ())]
+    return f"<section><h2>Calibration applied</h2>{table(rows)}</section>" if rows else ""
+
+
+def calibration_advice(file: RunFile) -> list[str]:
+    """A line for each calibration that could not be applied."""
+    return [
+        f"The {one['kind']} calibration {one['run']} was not applied: {one['why']}; "
+        f"run `umbra calibrate {one['kind']}`."
+        for one in (file.calibration or {}).get("ignored", ())
+    ]
+
+
+def timed(file: RunFile, timings: Mapping[str, float]) -> Iterable[tuple[str, str]]:
+    """Timings in words."""
+    for name, value in {**file.timings, **timings}.items():
         if name.endswith("_s"):
             yield name[:-2], f"{value:.3f} s" if value >= 1 else f"{value * 1e3:.1f} ms"
         elif name.endswith("_hz"):
@@ -281,7 +332,8 @@ def _timings(subject: Subject) -> Iterable[tuple[str, str]]:
             yield name, f"{value:g}"
 
 
-def _missing(records: Sequence[FrameRecord]) -> str:
+def missing(records: Records) -> str:
+    """Frames that are missing or were not used, and why."""
     reasons: dict[tuple[str, str], list[int]] = {}
     for r in records:
         if r.missing:
@@ -298,7 +350,8 @@ def _missing(records: Sequence[FrameRecord]) -> str:
     return f'<section><h2>Missing and rejected</h2><ul class="missing">{rows}</ul></section>'
 
 
-def _files(products: Sequence[Product]) -> str:
+def files(products: Sequence[Product]) -> str:
+    """Links to the products."""
     return "".join(
         f'<li><a href="./{quote(p.file)}">{escape(p.file)}</a>'
         f"<span>{_size(p.bytes)}{f' · {escape(p.unit)}' if p.unit else ''}</span></li>"
@@ -309,7 +362,8 @@ def _files(products: Sequence[Product]) -> str:
 # ---------------------------------------------------------------- words and numbers
 
 
-def _table(rows: Iterable[tuple[str, Any]]) -> str:
+def table(rows: Iterable[tuple[str, Any]]) -> str:
+    """Names and values."""
     made = "".join(
         f"<tr><th>{escape(str(k).replace('_', ' '))}</th><td>{escape(_value(v))}</td></tr>"
         for k, v in rows
@@ -317,11 +371,12 @@ def _table(rows: Iterable[tuple[str, Any]]) -> str:
     return f"<table>{made}</table>" if made else '<p class="quiet">Nothing was noted.</p>'
 
 
-def _flat(tree: Mapping[str, Any], path: str = "") -> Iterable[tuple[str, Any]]:
+def flat(tree: Mapping[str, Any], path: str = "") -> Iterable[tuple[str, Any]]:
+    """A tree of facts as rows."""
     for key, value in tree.items():
         name = f"{path} · {key}" if path else str(key)
         if isinstance(value, Mapping):
-            yield from _flat(value, name)
+            yield from flat(value, name)
         else:
             yield name, value
 

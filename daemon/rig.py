@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, cast
@@ -132,8 +132,11 @@ class Rig:
         """The devices' names."""
         return tuple(self._members)
 
-    def bench(self) -> Bench:
-        """The rig as a scan method sees it. Raises UmbraError where a device is missing or lost."""
+    def bench(self, calibration: Mapping[str, Any] | None = None) -> Bench:
+        """The rig as a scan method sees it, with the calibration that applies.
+
+        Raises UmbraError where a device is missing or lost.
+        """
         self.require_ready()
         projector, stage = self.projector, self.stage
         return Bench(
@@ -141,6 +144,8 @@ class Rig:
             projector=projector.device.info() if projector else None,
             stage=stage.device.info() if stage else None,
             lights=tuple(self.lights),
+            exposure_us=self.camera.device.settings().exposure_us,
+            calibration=calibration,
         )
 
     def require_ready(self) -> None:

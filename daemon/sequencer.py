@@ -11,6 +11,9 @@ A frame counts only if its exposure lies wholly within the time in which its pat
 the device's own time stamps, and if it looks like its pattern (`daemon.proof`). One that does not,
 that is incomplete, or that did not come in time is exposed again, `attempts` times in all; then it
 is an explicit missing record. Repeating is safe because a frame that is not recorded has no effect.
+
+Of the rig's calibration two things are applied here: the light is this pattern's only `latency_s`
+after the projector said so, and images are drawn through the inverse of its `tone`.
 """
 
 from __future__ import annotations
@@ -27,16 +30,17 @@ from numpy.typing import NDArray
 from daemon.config import SequencerSection
 from daemon.control import Control
 from daemon.devicethread import Session, Stuck
-from daemon.patterns import render
+from daemon.patterns import predistorted, render
 from daemon.proof import Proof
 from daemon.recorder import Exposed, Recorder
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Buffer, Ring
-from daemon.scans.method import Expose, Method, Step, Watch
+from daemon.scans.method import Digest, Expose, Method, Step, Watch
 from drivers.base import (
     Acquisition,
     Camera,
     CameraInfo,
+    CameraSettings,
     DeviceGarbled,
     DeviceTimeout,
     EndOfRecording,
@@ -108,6 +112,10 @@ class Sequencer:
         self._taken = 0
         self._pending: _Exposure | None = None
         self._drawn: tuple[AnyPattern, NDArray[np.uint8]] | None = None
+        calibration = method.bench.calibration or {}
+        self._latency_ns = round(float(calibration.get("latency_s", 0.0)) * NS)
+        self._tone: list[int] | None = calibration.get("tone")
+        self._exposure_us = self._camera.device.settings().exposure_us
         self._lit: Expose | None = None
         self._lit_ns = 0
         self._lit_image: NDArray[np.uint8] | None = None
@@ -128,6 +136,8 @@ class Sequencer:
                     self._acquisition = None
                 if isinstance(step, Expose):
                     self._expose(step_index, step, sub)
+                elif isinstance(step, Digest):
+                    self._digest()
                 else:
                     self._watch(step_index, step, sub)
                 step_index, sub = step_index + 1, 0
@@ -135,6 +145,7 @@ class Sequencer:
         finally:
             if not self._session.ended.is_set():
                 self._camera.call(lambda c: c.stop(), CALL_S, self._session)
+                self._set_exposure(None)
 
     def _summary(self) -> Mapping[str, float]:
         return self._recorder.summary
@@ -156,6 +167,7 @@ class Sequencer:
     def _expose(self, index: int, step: Expose, first: int) -> None:
         if first >= step.frames:
             return
+        self._set_exposure(step.exposure_us)
         self._acquire(Acquisition.SOFTWARE)
         self._light(step)
         for sub in range(first, step.frames):
@@ -167,6 +179,27 @@ class Sequencer:
                 self._draw_ahead(index + 1)
             self._await_exposure(self._pending)
 
+    def _set_exposure(self, wanted_us: float | None) -> None:
+        """Expose for so long from now on; None: as the run began."""
+        wanted_us = wanted_us or self._exposure_us
+        if wanted_us is None or wanted_us == self._camera.device.settings().exposure_us:
+            return
+        self._settle()  # what is being read out was exposed as before
+        wanted = CameraSettings(exposure_us=wanted_us)
+
+        def change(camera: Camera) -> None:
+            camera.stop()
+            camera.configure(wanted)
+
+        self._camera.call(change, CALL_S, self._session)
+        self._acquisition = None
+
+    def _digest(self) -> None:
+        """Wait until the estimator knows every frame so far."""
+        self._settle()
+        if not self._recorder.digested(_RING_S):
+            raise Behind
+
     def _light(self, step: Expose) -> None:
         """Make the light this step's; `_lit_ns` says from when it is."""
         if self._pending is not None:
@@ -176,18 +209,22 @@ class Sequencer:
             self._lit_ns = 0
         elif step.pattern is None:
             self._projector.call(lambda p: p.safe(), SAFE_S, self._session)
-            self._lit_ns = self._clock.now_ns()
+            self._lit_ns = self._clock.now_ns() + self._latency_ns
             self._lit_image = None
         else:
             image = self._lit_image = self._image(step)
-            self._lit_ns = self._projector.call(lambda p: p.show(image), SHOW_S, self._session)
+            flipped = self._projector.call(lambda p: p.show(image), SHOW_S, self._session)
+            self._lit_ns = flipped + self._latency_ns
 
     def _image(self, step: Expose) -> NDArray[np.uint8]:
         assert self._projector is not None
         assert step.pattern is not None
         if self._drawn is None or self._drawn[0] != step.pattern:
             info = self._projector.device.info()
-            self._drawn = (step.pattern, render(step.pattern, info.width, info.height))
+            image = render(step.pattern, info.width, info.height)
+            if self._tone is not None:
+                image = predistorted(image, self._tone)
+            self._drawn = (step.pattern, image)
         return self._drawn[1]
 
     def _draw_ahead(self, index: int) -> None:
@@ -203,6 +240,10 @@ class Sequencer:
         if buffer is None:
             self._recorder.check()
             raise Behind
+        if self._projector is not None:
+            begin = self._lit_ns + round(step.delay_s * NS)
+            self._clock.wait_until(begin, self._session.ended)
+            self._session.check()
         _, end_ns = self._camera.call(lambda c: c.trigger(), CALL_S, self._session)
         timeout_s = self._frame_deadline()
         grab = self._camera.submit(
@@ -236,7 +277,14 @@ class Sequencer:
                 frame = None
             self._pending = None
             if not problem and frame is not None:
-                self._put(exposure.index, exposure.step, exposure.sub, frame, exposure.buffer)
+                self._put(
+                    exposure.index,
+                    exposure.step,
+                    exposure.sub,
+                    frame,
+                    exposure.buffer,
+                    exposure.lit_ns,
+                )
                 return
             self._ring.give(exposure.buffer)
             if exposure.attempt < self._patience.attempts:
@@ -343,9 +391,13 @@ class Sequencer:
         self._camera.call(start, CALL_S, self._session)
         self._acquisition = wanted
 
-    def _put(self, index: int, step: Step, sub: int, frame: Frame, buffer: Buffer) -> None:
+    def _put(
+        self, index: int, step: Step, sub: int, frame: Frame, buffer: Buffer, lit_ns: int = 0
+    ) -> None:
         self._taken += 1
-        self._recorder.put(Exposed(step=step, index=index, sub=sub, frame=frame, buffer=buffer))
+        self._recorder.put(
+            Exposed(step=step, index=index, sub=sub, frame=frame, buffer=buffer, lit_ns=lit_ns)
+        )
 
     def _miss(self, index: int, step: Step, sub: int, reason: str) -> None:
         self._taken += 1

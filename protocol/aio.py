@@ -14,7 +14,7 @@ import weakref
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import zmq
 import zmq.asyncio
@@ -370,6 +370,10 @@ class AsyncRun:
         if check and (await self.refresh()).state is RunState.FAILED:
             raise failure(self.info)
         return await self._rig.result(self.id)
+
+    async def facts(self) -> dict[str, Any]:
+        """The figures of the run as they are now: see `protocol.run.Run.facts`."""
+        return await self._rig.facts(self.id)
 
     async def save(self, folder: Path | str) -> list[Path]:
         """Fetch all products into a folder, which is made; the files written."""

@@ -29,12 +29,14 @@ from protocol.results import (
     Part,
     Picture,
     Separation,
+    facts_of,
     message_of,
     part_of,
     picture_of,
     run_of,
     runs_of,
     separation_of,
+    stage_of,
 )
 from protocol.scans import AnyScan
 
@@ -109,6 +111,15 @@ class Commands:
         return Ask(m.GetDevices(), lambda a: expect(a.reply, m.Devices).devices)
 
     @command
+    def discover(self, *drivers: str, timeout_s: float = 15.0) -> Ask[tuple[m.Search, ...]]:
+        """What is attached, asked of the drivers named, or of all. They broadcast on networks."""
+        return Ask(
+            m.Discover(drivers=drivers, timeout_s=timeout_s),
+            lambda a: expect(a.reply, m.Discovered).searches,
+            timeout_s + SLOW_S,
+        )
+
+    @command
     def submit(self, spec: AnyScan, *, first: bool = False) -> Ask[RunInfo]:
         """Queue a scan, ahead of the others if `first`; comes back at once. `scan` gives a Run."""
         return Ask(m.Submit(spec=spec, by=self.name, first=first), run_of)
@@ -164,6 +175,11 @@ class Commands:
         return Ask(m.GetResult(run=run), separation_of, SLOW_S)
 
     @command
+    def facts(self, run: str = "") -> Ask[dict[str, Any]]:
+        """The figures of a run, final or so far: of a separation quality.json's, else its own."""
+        return Ask(m.GetResult(run=run), facts_of, SLOW_S)
+
+    @command
     def product_part(self, run: str, name: str, offset: int = 0, limit: int = 8 << 20) -> Ask[Part]:
         """A part of a product's file; `download` fetches a whole one."""
         return Ask(m.GetProduct(run=run, name=name, offset=offset, limit=limit), part_of, SLOW_S)
@@ -214,6 +230,45 @@ class Commands:
     def light(self, name: str, on: bool) -> Ask[str]:
         """Switch a light."""
         return Ask(m.SetLight(name=name, on=on), message_of)
+
+    @command
+    def stage(self) -> Ask[m.StageStatus]:
+        """Where the stage is and what it is doing."""
+        return Ask(m.GetStage(), stage_of)
+
+    @command
+    def stage_home(self, timeout_s: float = 60.0) -> Ask[m.StageStatus]:
+        """Begin to find the stage's origin; `stage` and the topic stage show the end."""
+        return Ask(m.StageHome(timeout_s=timeout_s), stage_of)
+
+    @command
+    def stage_move(self, x_mm: float, y_mm: float, feed_mm_s: float) -> Ask[m.StageStatus]:
+        """Begin to go straight to a point."""
+        return Ask(m.StageMove(x_mm=x_mm, y_mm=y_mm, feed_mm_s=feed_mm_s), stage_of, SLOW_S)
+
+    @command
+    def stage_circle(
+        self,
+        centre_mm: tuple[float, float],
+        radius_mm: float,
+        feed_mm_s: float,
+        turns: float | None = None,
+    ) -> Ask[m.StageStatus]:
+        """Begin to go round a circle; without `turns` until `stage_stop`."""
+        asked = m.StageCircle(
+            centre_mm=centre_mm, radius_mm=radius_mm, feed_mm_s=feed_mm_s, turns=turns
+        )
+        return Ask(asked, stage_of, SLOW_S)
+
+    @command
+    def stage_stop(self) -> Ask[m.StageStatus]:
+        """End every motion of the stage, whoever asked for it."""
+        return Ask(m.StageStop(), stage_of, SLOW_S)
+
+    @command
+    def stage_unlock(self) -> Ask[m.StageStatus]:
+        """Leave the stage's alarm without homing."""
+        return Ask(m.StageUnlock(), stage_of, SLOW_S)
 
     @command
     def dark(self) -> Ask[str]:

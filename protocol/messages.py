@@ -209,6 +209,24 @@ class CameraSettings(Fact, frozen=True, kw_only=True):
     ) = None
 
 
+class Found(Fact, frozen=True, kw_only=True):
+    """A device that is attached."""
+
+    model: str
+    serial: str
+    toml: str  # to paste into rig.toml
+    used_by: str = ""  # the rig's device that is this one already
+
+
+class Search(Fact, frozen=True, kw_only=True):
+    """What one driver found, or why it could not look."""
+
+    kind: str
+    driver: str
+    found: tuple[Found, ...] = ()
+    problem: str = ""  # with the remedy
+
+
 # ---------------------------------------------------------------- commands
 
 
@@ -230,6 +248,18 @@ class GetStatus(Command, frozen=True, kw_only=True, tag="status"):
 
 class GetDevices(Command, frozen=True, kw_only=True, tag="devices"):
     """The devices in detail."""
+
+
+class Discover(Command, frozen=True, kw_only=True, tag="discover"):
+    """What is attached, driver by driver. Refused while a run uses the devices.
+
+    Vendors' libraries look for cameras by broadcasts on every network, so this happens only when
+    it is asked for, and by the drivers that are named, or else installed.
+    """
+
+    role: ClassVar[Role] = Role.OPERATOR
+    drivers: tuple[str, ...] = ()  # none named: every one that is installed
+    timeout_s: Annotated[float, Meta(gt=0, le=120)] = 15.0  # for each; they look side by side
 
 
 class Submit(Command, frozen=True, kw_only=True, tag="submit"):
@@ -305,6 +335,7 @@ class GetResult(Command, frozen=True, kw_only=True, tag="result"):
     """Direct and global as float32 arrays, at any time from the first frames on.
 
     Arrays: `direct`, `global` (H x W or H x W x 3, RGB, linear counts), `quality` (uint16 bits).
+    A run that measures (a calibration, a verification) is answered with its facts, and no arrays.
     """
 
     run: str = ""
@@ -442,9 +473,9 @@ class Unlock(Command, frozen=True, kw_only=True, tag="unlock"):
 
 
 AnyCommand = (
-    Hello | GetStatus | GetDevices | Submit | GetQueue | MoveQueued | Pause | Resume | Abort
-    | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct | GetLog | GetPreview | Show
-    | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove | StageCircle
+    Hello | GetStatus | GetDevices | Discover | Submit | GetQueue | MoveQueued | Pause | Resume
+    | Abort | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct | GetLog | GetPreview
+    | Show | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove | StageCircle
     | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
 )  # fmt: skip
 
@@ -492,6 +523,12 @@ class Devices(Reply, frozen=True, kw_only=True, tag="devices"):
     devices: tuple[DeviceInfo, ...]
 
 
+class Discovered(Reply, frozen=True, kw_only=True, tag="discovered"):
+    """Answer to `discover`."""
+
+    searches: tuple[Search, ...]
+
+
 class Run(Reply, frozen=True, kw_only=True, tag="run"):
     """Answer to all that is about one run."""
 
@@ -505,7 +542,8 @@ class Runs(Reply, frozen=True, kw_only=True, tag="runs"):
 
 
 class Result(Reply, frozen=True, kw_only=True, tag="result"):
-    """Answer to `result`; final when the run is done. `facts` is quality.json's content so far."""
+    """Answer to `result`; final when the run is done. `facts` is the content so far of
+    quality.json, or the figures of a run that measures."""
 
     run: RunInfo
     final: bool
@@ -562,14 +600,15 @@ class Done(Reply, frozen=True, kw_only=True, tag="done"):
 
 
 AnyReply = (
-    Welcome | Status | Devices | Run | Runs | Result | ProductPart | Log | Picture | Camera
-    | StageStatus | Locked | Done
+    Welcome | Status | Devices | Discovered | Run | Runs | Result | ProductPart | Log | Picture
+    | Camera | StageStatus | Locked | Done
 )  # fmt: skip
 
 ANSWERS: dict[type[Command], type[Reply]] = {
     Hello: Welcome,
     GetStatus: Status,
     GetDevices: Devices,
+    Discover: Discovered,
     Submit: Run,
     GetQueue: Runs,
     MoveQueued: Runs,
@@ -648,6 +687,15 @@ class RigChanged(EventBody, frozen=True, kw_only=True, tag="rig-changed"):
     reason: str = ""
 
 
+class StageChanged(EventBody, frozen=True, kw_only=True, tag="stage-changed"):
+    """The stage is moved by hand: told a few times a second, and when it has come to rest."""
+
+    topic: ClassVar[str] = "stage"
+    state: StageState
+    position_mm: tuple[float, float] | None  # None while it is unknown
+    detail: str = ""  # why it stopped short
+
+
 class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
     """A small picture of the latest frame or separation. Array: `preview` (uint8, RGB)."""
 
@@ -657,7 +705,10 @@ class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
     facts: dict[str, Any] = {}
 
 
-AnyEvent = RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | PreviewTaken
+AnyEvent = (
+    RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | StageChanged
+    | PreviewTaken
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- envelopes

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from protocol import messages as m
 from protocol.connection import Answer, expect
+from protocol.errors import Code, UmbraError
 from protocol.messages import RunInfo
 
 if TYPE_CHECKING:
@@ -55,8 +56,13 @@ class Separation:
 
 
 def separation_of(answer: Answer) -> Separation:
-    """Of a result."""
+    """Of a result. Raises UmbraError(no_result) for a run that measures and separates nothing."""
     reply = expect(answer.reply, m.Result)
+    if not answer.arrays:
+        raise UmbraError(
+            Code.NO_RESULT,
+            f"run {reply.run.id} measures: it has figures (facts), not direct and global",
+        )
     return Separation(
         direct=answer.array("direct", "float32"),
         global_=answer.array("global", "float32"),
@@ -65,6 +71,11 @@ def separation_of(answer: Answer) -> Separation:
         facts=reply.facts,
         final=reply.final,
     )
+
+
+def facts_of(answer: Answer) -> dict[str, Any]:
+    """The figures of a result, whatever it is."""
+    return expect(answer.reply, m.Result).facts
 
 
 def picture_of(*names: str) -> Callable[[Answer], Picture]:
@@ -86,6 +97,11 @@ def run_of(answer: Answer) -> RunInfo:
 def runs_of(answer: Answer) -> tuple[RunInfo, ...]:
     """Of an answer about several runs."""
     return expect(answer.reply, m.Runs).runs
+
+
+def stage_of(answer: Answer) -> m.StageStatus:
+    """Of an answer about the stage."""
+    return expect(answer.reply, m.StageStatus)
 
 
 def message_of(answer: Answer) -> str:

@@ -6,7 +6,7 @@ import html
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from protocol.arrivals import place_in
 from protocol.errors import Code, UmbraError
@@ -103,6 +103,10 @@ class Run:
         if check and self.refresh().state is RunState.FAILED:
             raise failure(self.info)
         return self._rig.result(self.id)
+
+    def facts(self) -> dict[str, Any]:
+        """The figures of the run as they are now; of a calibration or verification all it has."""
+        return self._rig.facts(self.id)
 
     def save(self, folder: Path | str) -> list[Path]:
         """Fetch all products into a folder, which is made; the files written."""

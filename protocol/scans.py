@@ -66,14 +66,19 @@ class Radiometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     ) = None
 
 
-class Scan(
+class Spec(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="method"
 ):
-    """What every scan can be told, whatever its method."""
+    """What every run can be told, whatever it is for."""
 
     note: Annotated[str, Meta(description="what the run is for, kept with it")] = ""
     exposure_us: Annotated[Positive, Meta(description="exposure of a frame in µs")] | None = None
     gain: Annotated[float, Meta(description="of the camera, in its own unit")] | None = None
+
+
+class Scan(Spec, frozen=True, kw_only=True):
+    """What every scan that separates can be told."""
+
     radiometry: Radiometry = Radiometry()
     #: None: black and white where the source can show them
     references: (
@@ -235,7 +240,63 @@ class SingleImage(PatternScan, frozen=True, kw_only=True, tag="single-image"):
     repeat: Annotated[Count, Meta(description="images, one after the other; live: many")] = 1
 
 
-AnyScan = (
+class Measuring(Spec, frozen=True, kw_only=True):
+    """A run that measures the rig, or how well it separates: it ends in figures and plots."""
+
+
+class Calibration(Measuring, frozen=True, kw_only=True):
+    """A measurement that later runs apply by themselves, for as long as it is valid."""
+
+    @property
+    def kind(self) -> str:
+        """What it calibrates: dark, noise, leak, tone or latency."""
+        return str(self.__struct_config__.tag).removeprefix("calibrate-")
+
+
+Levels = Annotated[int, Meta(ge=3, le=256)]
+
+
+class CalibrateDark(Calibration, frozen=True, kw_only=True, tag="calibrate-dark"):
+    """Black level, read noise and hot pixels of the camera; put its lens cap on if it has one."""
+
+    exposures: Annotated[int, Meta(ge=2, le=32, description="exposure times, doubled from one to "
+                                   "the next up to the present one")] = 4  # fmt: skip
+    frames: Annotated[int, Meta(ge=2, le=1000, description="frames at each exposure")] = 8
+
+
+class CalibrateNoise(Calibration, frozen=True, kw_only=True, tag="calibrate-noise"):
+    """The camera's gain and noise by photon transfer: pairs of frames at several exposures."""
+
+    exposures: Annotated[int, Meta(ge=2, le=32, description="exposure times, evenly spread up to "
+                                   "the present one")] = 6  # fmt: skip
+    pairs: Annotated[int, Meta(ge=1, le=500, description="pairs of frames at each exposure")] = 4
+
+
+class CalibrateLeak(Calibration, frozen=True, kw_only=True, tag="calibrate-leak"):
+    """The projector's leakage b, and what lit and unlit patches of several sizes keep of it."""
+
+    sizes: Annotated[
+        tuple[Annotated[int, Meta(ge=1, le=256)], ...],
+        Meta(min_length=2, description="sides of the patches, projector px; largest: reference"),
+    ] = (1, 2, 3, 4, 6, 8, 12, 16)
+    average: Annotated[int, Meta(ge=2, le=1000, description="frames averaged a pattern")] = 2
+
+
+class CalibrateTone(Calibration, frozen=True, kw_only=True, tag="calibrate-tone"):
+    """The projector's response to its levels; patterns are then drawn so that light is linear."""
+
+    levels: Annotated[Levels, Meta(description="levels, evenly spread from black to white")] = 33
+    average: Annotated[Count, Meta(description="frames averaged a level")] = 2
+
+
+class CalibrateLatency(Calibration, frozen=True, kw_only=True, tag="calibrate-latency"):
+    """How much later than the driver says the projector's light changes, and its spread."""
+
+    longest_ms: Annotated[Positive, Meta(le=2000, description="delays up to this are found")] = 100
+    flashes: Annotated[int, Meta(ge=8, le=1000, description="flashes, their triggers spread")] = 48
+
+
+AnySeparation = (
     Checkerboard
     | TwoImage
     | Stick
@@ -246,3 +307,5 @@ AnyScan = (
     | RandomBinary
     | SingleImage
 )
+AnyCalibration = CalibrateDark | CalibrateNoise | CalibrateLeak | CalibrateTone | CalibrateLatency
+AnyScan = AnySeparation | AnyCalibration

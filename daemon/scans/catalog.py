@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from daemon.scans.calibrate_dark import DarkMethod
+from daemon.scans.calibrate_latency import LatencyMethod
+from daemon.scans.calibrate_leak import LeakMethod
+from daemon.scans.calibrate_noise import NoiseMethod
+from daemon.scans.calibrate_tone import ToneMethod
 from daemon.scans.checkerboard import CheckerboardMethod
 from daemon.scans.gray_code import GrayCodeMethod
 from daemon.scans.mesh import MeshMethod
@@ -15,6 +20,11 @@ from daemon.scans.stick import StickMethod
 from daemon.scans.two_image import TwoImageMethod
 from protocol.scans import (
     AnyScan,
+    CalibrateDark,
+    CalibrateLatency,
+    CalibrateLeak,
+    CalibrateNoise,
+    CalibrateTone,
     Checkerboard,
     GrayCode,
     Mesh,
@@ -36,6 +46,11 @@ _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     GrayCode: GrayCodeMethod,
     RandomBinary: RandomBinaryMethod,
     SingleImage: SingleImageMethod,
+    CalibrateDark: DarkMethod,
+    CalibrateNoise: NoiseMethod,
+    CalibrateLeak: LeakMethod,
+    CalibrateTone: ToneMethod,
+    CalibrateLatency: LatencyMethod,
 }
 
 NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())

@@ -14,9 +14,9 @@ from typing import Any, ClassVar, Generic, TypeVar
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation
 from drivers.base import CameraInfo, ProjectorInfo, StageInfo
 from protocol.patterns import AnyPattern
-from protocol.scans import Scan
+from protocol.scans import Spec
 
-S = TypeVar("S", bound=Scan)
+S = TypeVar("S", bound=Spec)
 
 
 class Unsuitable(Exception):
@@ -35,7 +35,8 @@ class Bench:
     projector: ProjectorInfo | None = None
     stage: StageInfo | None = None
     lights: tuple[str, ...] = ()
-    calibration: Mapping[str, Any] | None = None  # of this rig's devices, by name
+    exposure_us: float | None = None  # of the camera as it is set
+    calibration: Mapping[str, Any] | None = None  # values that apply: see daemon.calibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,8 @@ class Expose:
     lighting: Lighting = Lighting.PATTERN
     index: int = 0  # which of the pattern set
     frames: int = 1
+    exposure_us: float | None = None  # None: the run's
+    delay_s: float = 0.0  # from the light being the pattern's to the first trigger
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +87,13 @@ class Watch:
     lights: tuple[str, ...] = ()
 
 
-Step = Expose | Watch
+@dataclass(frozen=True, slots=True)
+class Digest:
+    """A step without frames: the next is asked for only when the estimator has taken in all frames
+    before it, so that it may depend on what they said."""
+
+
+Step = Expose | Watch | Digest
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +104,8 @@ class Taken:
     sub: int
     incomplete: bool
     source: str = ""
+    delay_us: float = 0.0  # see Observation
+    exposure_us: float = 0.0
 
 
 class Method(ABC, Generic[S]):

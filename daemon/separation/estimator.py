@@ -1,4 +1,4 @@
-"""The contract between frames and components: observations go in, components come out.
+"""The contract between frames and results: observations go in, components come out, or figures.
 
 An estimator is pure: no I/O, no threads, no clock; its memory does not grow with the frames; and
 the same observations in the same order give the same bits, so that a resumed or reprocessed run
@@ -37,6 +37,8 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     weight: float = 1.0
     strength: float = 1.0  # of the source in this frame, relative to the run's reference
     warp: tuple[float, ...] | None = None  # 2x3 affine, row by row: frame -> reference
+    delay_us: float = 0.0  # of the exposure's start, after the light was said to be the pattern's
+    exposure_us: float = 0.0  # as the device gave it; 0: unknown
 
 
 class Quality(enum.IntFlag):
@@ -71,20 +73,63 @@ class Components:
     facts: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A series of figures: `y` and its standard deviation `sd` (None: not known) against `x`, all
+    float64 of one length. `line`: y = line[0] + line[1] x was fitted to it."""
+
+    name: str
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    sd: NDArray[np.float64] | None = None
+    line: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """Curves over common axes; the labels name the quantity and its unit."""
+
+    title: str
+    x: str
+    y: str
+    curves: tuple[Curve, ...]
+    from_zero: bool = True  # the y axis begins at 0
+    log_x: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What a run found out where it does not end in a separation: a calibration, a verification.
+
+    `facts`: figures, JSON-able; `plots` by name; `planes`: (H, W) float32 or uint16 by name.
+    `name` is the name of the figures' file. Of the facts, `figures` are [name, value] pairs of text
+    for a person's first look, `criteria` are {"criterion", "measured", "met"}, and `advice` lines.
+    """
+
+    facts: dict[str, Any]
+    plots: dict[str, Plot] = field(default_factory=dict)
+    planes: dict[str, NDArray[Any]] = field(default_factory=dict)
+    name: str = "measurement"
+
+
+Result = Components | Measurement
+"""What an estimator comes to."""
+
+
 class NotYet(Exception):
     """There are too few observations for any result; says what is missing."""
 
 
 class Estimator(Protocol):
-    """Frames in, components out."""
+    """Frames in, components (or a measurement) out."""
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """Take in one frame, (H, W) or (H, W, 3), uint8 or uint16; `pixels` is only read, and not
         kept. Unused observations are counted, not more."""
         ...
 
-    def result(self) -> Components:
-        """Components from what has come so far; does not change the estimator. Raises NotYet."""
+    def result(self) -> Result:
+        """The result from what has come so far; does not change the estimator. Raises NotYet."""
         ...
 
     def summary(self) -> dict[str, float]:

@@ -22,6 +22,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "Scans": {
         "scan": ("scan:app", "Queue a scan: checkerboard, two-image, stick ..."),
+        "calibrate": ("scan:calibrate", "Calibrate the rig: dark, noise, leak, tone, latency."),
         "watch": ("watch:watch", "Follow a run: progress, rate, time left."),
         "runs": ("runs:runs", "List runs, the newest first."),
         "run": ("runs:run", "One run in detail."),
@@ -46,6 +47,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "snap": ("hand:snap", "Take one frame and save it as PNG."),
         "camera": ("hand:camera", "Read or change the camera's settings."),
         "light": ("hand:light", "Switch a light on or off."),
+        "stage": ("stage:app", "Where the stage is; home, move, circle, stop, unlock."),
     },
 }
 

@@ -18,7 +18,7 @@ from protocol.cli.runs import fetch, wanted
 from protocol.cli.watch import follow, must_be_done
 from protocol.cli.words import Fetched, frames
 from protocol.errors import Code, UmbraError
-from protocol.scans import AnyScan
+from protocol.scans import AnySeparation
 
 if TYPE_CHECKING:
     from protocol.run import Run
@@ -36,7 +36,7 @@ class Demonstrated(Fetched, frozen=True, kw_only=True):
 def _demo(
     *,
     method: Annotated[
-        str, tag_option(AnyScan, "-m", "--method", help_text="The scan.")
+        str, tag_option(AnySeparation, "-m", "--method", help_text="The scan.")
     ] = "checkerboard",
     out: Annotated[
         Path | None,

@@ -56,16 +56,20 @@ class Family(TyperGroup):
     act: ClassVar[Callable[..., Any]]
     more: ClassVar[dict[str, Callable[..., Any]]] = {}
     title: ClassVar[str] = "Commands"
+    prefix: ClassVar[str] = ""  # of the tags, left out of the commands' names
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
         """The further commands and the union's tags."""
-        return [*self.more, *members(self.union)]
+        return [*self.more, *self._structs()]
+
+    def _structs(self) -> dict[str, type[msgspec.Struct]]:
+        return {tag.removeprefix(self.prefix): s for tag, s in members(self.union).items()}
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
         """The command of one struct, made now; None if there is none of this tag."""
         if cmd_name in self.more:
             return command_of(cmd_name, self.more[cmd_name])
-        struct = members(self.union).get(cmd_name)
+        struct = self._structs().get(cmd_name)
         return command_of(cmd_name, _command(struct, type(self).act)) if struct else None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -77,7 +81,7 @@ class Family(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
         """Names and docstrings."""
         rows = [(name, (inspect.getdoc(f) or "").split("\n")[0]) for name, f in self.more.items()]
-        rows += [(tag, about(struct)) for tag, struct in members(self.union).items()]
+        rows += [(tag, about(struct)) for tag, struct in self._structs().items()]
         with formatter.section(self.title):
             formatter.write_dl(rows)
 

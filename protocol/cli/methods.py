@@ -9,9 +9,9 @@ from typing import Any
 from protocol.cli.family import member, members
 from protocol.cli.options import Option, build, options_of
 from protocol.errors import Code, UmbraError
-from protocol.scans import AnyScan
+from protocol.scans import AnyScan, AnySeparation
 
-METHODS = members(AnyScan)
+METHODS = members(AnySeparation)
 
 
 def spec_of(method: str, given: Mapping[str, Any], **fixed: Any) -> AnyScan:
@@ -19,7 +19,7 @@ def spec_of(method: str, given: Mapping[str, Any], **fixed: Any) -> AnyScan:
 
     Raises UmbraError(bad_request) for an option of another method, or a bad value.
     """
-    struct: Any = member(AnyScan, method, "--method")
+    struct: Any = member(AnySeparation, method, "--method")
     own = {option.name for option in options_of(struct)}
     for name, value in given.items():
         if value is not None and name not in own:

@@ -22,7 +22,7 @@ from protocol.cli.watch import conclude, follow, goes_on
 from protocol.cli.words import Fetched
 from protocol.errors import Code, UmbraError
 from protocol.messages import Run
-from protocol.scans import AnyScan
+from protocol.scans import AnyCalibration, AnyScan, AnySeparation
 
 
 def scan(
@@ -78,7 +78,7 @@ def scan(
 class Methods(Family):
     """One command a scan method."""
 
-    union = AnyScan
+    union = AnySeparation
     act = scan
     title = "Methods"
 
@@ -95,6 +95,15 @@ def spec_in(file: Path) -> AnyScan:
         message = str(error).replace("`", "").replace("Object contains", "there is an")
         raise UmbraError(Code.BAD_REQUEST, f"{file}: {message}", "--file") from error
     return spec
+
+
+class Calibrations(Family):
+    """One command a calibration."""
+
+    union = AnyCalibration
+    act = scan
+    title = "Calibrations"
+    prefix = "calibrate-"
 
 
 def _scan(
@@ -133,3 +142,23 @@ app = typer.Typer(cls=Methods, rich_markup_mode=None, add_completion=False)
 app.callback(invoke_without_command=True)(
     with_options(_scan, list(inspect.signature(scan, eval_str=True).parameters.values())[1:])
 )
+
+
+calibrate = typer.Typer(cls=Calibrations, rich_markup_mode=None, add_completion=False)
+
+
+@calibrate.callback(invoke_without_command=True)
+def _calibrate(context: typer.Context, rig: Rig = None, keys: Keys = None) -> None:
+    """Queue a calibration of the rig; prints the run's id. Later runs apply it by themselves.
+
+    It is applied while the devices are the same ones and it is not too old (rig.toml:
+    calibration.max_age_days). --wait and -o DIR as in `umbra scan`.
+
+    --json: a Run; with -o {"run": RunInfo, "files": [path, ...]}.
+    """
+    context.obj = {"rig": rig, "keys": keys}
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+__all__: list[Any] = ["app", "calibrate", "scan"]

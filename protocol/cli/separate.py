@@ -21,7 +21,7 @@ from protocol.cli.watch import follow, must_be_done
 from protocol.cli.words import Fetched, frames
 from protocol.errors import Code, UmbraError
 from protocol.messages import Health, RunInfo
-from protocol.scans import AnyScan, Reference
+from protocol.scans import AnySeparation, Reference
 
 if TYPE_CHECKING:
     from protocol.client import Client
@@ -53,7 +53,7 @@ def _separate(
         Path, typer.Argument(metavar="DIR", help="A folder of images in natural order, or a video.")
     ],
     method: Annotated[
-        str, tag_option(AnyScan, "-m", "--method", help_text="How the scene was lit.")
+        str, tag_option(AnySeparation, "-m", "--method", help_text="How the scene was lit.")
     ],
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="OUT", help="Folder for the products.")

@@ -90,7 +90,9 @@ class Scene:
                 estimator.update(self.frame(step, rng), observation)
             index += 1
         assert index
-        return method.conclude(estimator.result())
+        components = estimator.result()
+        assert isinstance(components, Components)
+        return method.conclude(components)
 
 
 DARK = Expose(BLACK)

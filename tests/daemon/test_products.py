@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon import products
+from daemon import products, staging
 from daemon.display import UNMEASURED, common_white, for_display, thumbnail
 from daemon.durable import Damaged, StorageError
 from daemon.frames import FrameRecord, FrameStore
@@ -122,7 +122,7 @@ def test_a_failed_write_leaves_the_earlier_products(
         if path.name == "preview.png":
             raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(products, "fsync_file", full)
+    monkeypatch.setattr(staging, "fsync_file", full)
     second = components()
     second.direct[...] = 1
     with pytest.raises(StorageError) as caught:

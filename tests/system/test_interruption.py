@@ -11,6 +11,7 @@ import umbra
 from daemon.frames import FrameStore
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
+from daemon.separation.estimator import Components
 from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
 from protocol.errors import Code, UmbraError
 from protocol.messages import RunState
@@ -32,6 +33,7 @@ def over_the_same_frames(daemon: Daemon, run: str) -> tuple[np.ndarray, np.ndarr
     for record in frames.records():
         estimator.update(frames.read(record.index), record.observation)
     components = estimator.result()
+    assert isinstance(components, Components)
     return components.direct, components.global_
 
 

@@ -1,0 +1,50 @@
+"""Black level, read noise, hot pixels."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from daemon.scans.measuring import MeasuringMethod
+from daemon.scans.method import Bench, Expose, Unsuitable
+from daemon.separation.dark import Dark
+from daemon.separation.estimator import Lighting
+from protocol.scans import CalibrateDark
+
+
+class DarkMethod(MeasuringMethod[CalibrateDark]):
+    """All sources off, the exposure doubled from step to step up to the run's own."""
+
+    name: ClassVar[str] = "calibrate-dark"
+
+    def __init__(self, spec: CalibrateDark, bench: Bench) -> None:
+        super().__init__(spec, bench)
+        longest = exposure_of(spec.exposure_us, bench)
+        shortest = bench.camera.exposure_range_us[0]
+        times = [longest / 2**n for n in reversed(range(spec.exposures))]
+        times = [time for time in times if time >= shortest]
+        if len(times) < 2:
+            raise Unsuitable(
+                f"an exposure of {longest:g} µs leaves no shorter ones (the camera's shortest is "
+                f"{shortest:g} µs): expose longer (--exposure)",
+                "$.exposure_us",
+            )
+        self._plan = [
+            Expose(None, Lighting.AMBIENT, index, spec.frames, exposure_us=time)
+            for index, time in enumerate(times)
+        ]
+
+    def estimator(self) -> Dark:
+        """See `Method`."""
+        pixel_format = self.bench.camera.pixel_format
+        return Dark(pixel_format.full_scale, len(self._plan), pixel_format.bayer)
+
+
+def exposure_of(asked_us: float | None, bench: Bench) -> float:
+    """The run's exposure in µs: as asked for, else the camera's present one.
+
+    Raises Unsuitable for a camera that does not say.
+    """
+    found = asked_us if asked_us is not None else bench.exposure_us
+    if found is None:
+        raise Unsuitable("the camera does not say how long it exposes: --exposure", "$.exposure_us")
+    return found

@@ -1,0 +1,195 @@
+"""Leakage: what an unlit part of the projector's image emits, of what a lit one does (§3.5)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation.estimator import (
+    Curve,
+    Lighting,
+    Measurement,
+    NotYet,
+    Observation,
+    Plot,
+)
+from daemon.separation.radiometry import FrameMean, Plane, Response
+from daemon.separation.sampling import Mask, bright, median_ratio, ratio
+
+_RESOLVED = 0.5
+"""A size whose contrast is less than this part of the largest's is not resolved."""
+_DIRECT = 0.25
+"""Of the light, at least this part must be direct where contrast is measured."""
+_SURE = 0.05
+
+
+class Leak:
+    """References, then checkers of several sizes, the largest first -> b, and b of each size.
+
+    Over the whole picture b = (K - A)/(W - A), from black, white and source-off frames: direct and
+    global light leak alike. A patch of p x p pixels gets more, from its lit neighbours, by the
+    blur of the optics. With C(p) the contrast of checkers and their complements, where over all
+    shifts it is greatest, relative to that of the largest, which has (1 - b), a lit patch emits
+    (1 + b + C)/2 and an unlit one (1 + b - C)/2, and their ratio is b(p).
+
+    Patterns are numbered through; each is followed by its complement. Memory: ten planes.
+    """
+
+    def __init__(self, response: Response, sizes: tuple[int, ...], images: tuple[int, ...]) -> None:
+        """`sizes` descend; `images` of each."""
+        self._response = response
+        self._sizes = sizes
+        self._ends = np.cumsum(images)
+        self._references = {kind: FrameMean(response) for kind in Lighting}
+        self._halves = (FrameMean(response), FrameMean(response))
+        self._taken = 0
+        self._shown: tuple[Plane, Plane] | None = None  # a pattern, until its complement comes
+        self._best: tuple[Plane, Plane] | None = None
+        self._saturated: Mask | None = None
+        self._good: Mask | None = None
+        self._largest: Plane | None = None
+        self._contrast: dict[int, tuple[float, float]] = {}
+
+    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
+        """See `Estimator`."""
+        if observation.lighting is not Lighting.PATTERN:
+            if observation.used:
+                self._references[observation.lighting].add(pixels)
+                if observation.lighting is Lighting.WHITE:
+                    saturated = pixels >= self._response.saturated_from
+                    known = self._saturated
+                    self._saturated = saturated if known is None else known | saturated
+            return
+        if observation.used:
+            self._halves[self._taken % 2].add(pixels)
+            self._taken += 1
+        if observation.last:
+            self._pattern(observation.pattern)
+
+    def _pattern(self, pattern: int) -> None:
+        first, second = self._halves
+        if self._taken:
+            choosing = first.value()
+            measuring = second.value() if second.frames else choosing
+            if self._shown is None:
+                self._shown = choosing, measuring
+            else:
+                self._compare(self._shown[0] - choosing, self._shown[1] - measuring)
+                self._shown = None
+        first.clear()
+        second.clear()
+        self._taken = 0
+        if pattern + 1 in self._ends:
+            self._close(int(np.searchsorted(self._ends, pattern, side="right")))
+
+    def _compare(self, choosing: Plane, measuring: Plane) -> None:
+        """Keep the pair with the greatest contrast, chosen by one half of the frames and measured
+        by the other: else noise would choose, and be measured with the light."""
+        size, contrast = np.abs(choosing), np.sign(choosing) * measuring
+        if self._best is not None:
+            better = size > self._best[0]
+            size = np.where(better, size, self._best[0])
+            contrast = np.where(better, contrast, self._best[1])
+        self._best = size, contrast
+
+    def _close(self, number: int) -> None:
+        if self._best is None:
+            raise ValueError("a size has come to its end without a pattern and its complement")
+        contrast = self._best[1]
+        self._best = None
+        if self._largest is None:
+            ambient, white = self._ambient(), self._references[Lighting.WHITE].value()
+            if self._saturated is None:
+                raise ValueError("patches are measured against references, which come first")
+            good = bright(ambient, white, self._saturated)
+            self._good = good & (contrast > _DIRECT * (white - ambient))
+            self._largest = contrast
+            if np.count_nonzero(self._good) < 64:
+                raise NotYet(
+                    "hardly any pixel sees direct light: focus the projector on the scene, and "
+                    "keep larger patches among the sizes (--sizes)"
+                )
+        assert self._good is not None
+        self._contrast[self._sizes[number]] = median_ratio(contrast, self._largest, self._good)
+
+    def _ambient(self) -> Plane:
+        return self._references[Lighting.AMBIENT].value()
+
+    def result(self) -> Measurement:
+        """See `Estimator`. Raises NotYet before all sizes are in."""
+        if len(self._contrast) < len(self._sizes) or self._saturated is None:
+            raise NotYet(f"{len(self._contrast)} of {len(self._sizes)} sizes have been taken")
+        ambient = self._ambient()
+        black, white = (self._references[k].value() for k in (Lighting.BLACK, Lighting.WHITE))
+        good = bright(ambient, white, self._saturated)
+        b, b_sd = ratio(black - ambient, white - ambient, good)
+        b_sd = float(np.hypot(np.nan_to_num(b_sd), self._uncertain_black(white - ambient, good)))
+        rows = [self._of_size(size, b, b_sd) for size in sorted(self._sizes)]
+        measured = [row for row in rows if row["measurable"]]
+        plateau = next((row["size"] for row in measured if row["leakage"] - b < 0.02), None)
+        advice = []
+        lost = [str(row["size"]) for row in rows if not row["measurable"]]
+        if lost:
+            advice.append(
+                f"Leakage cannot be measured for patches of {', '.join(lost)} px: the optics of "
+                "projector and camera blur a patch with its neighbours."
+            )
+        if plateau is None:
+            advice.append("Even the largest patches leak: focus the projector.")
+        if b > 0.2:
+            advice.append("Unlit pixels leak a fifth of the light: lower the projector's black.")
+        facts = {
+            "values": {
+                "leakage": round(max(b, 0.0), 5),
+                "leakage_sd": round(b_sd, 5),
+                "leakage_by_size": [[row["size"], row["leakage"], row["sd"]] for row in measured],
+            },
+            "leakage": round(b, 5),
+            "leakage_sd": round(b_sd, 5),
+            "by_size": rows,
+            "plateau_from_px": plateau,
+            "figures": [
+                ["leakage b", f"{b:.4f} ± {b_sd:.4f}"],
+                ["holds for patches from", "no size" if plateau is None else f"{plateau} px"],
+                ["cannot be measured for", f"{', '.join(lost)} px" if lost else "none"],
+            ],
+            "advice": advice,
+        }
+        sizes = np.asarray([row["size"] for row in rows], dtype=np.float64)
+        known = [row["leakage"] if row["measurable"] else np.nan for row in rows]
+        flat = Curve("whole picture", sizes, np.full(sizes.size, b), np.full(sizes.size, b_sd))
+        by_size = Curve("patches", sizes, np.asarray(known), np.asarray([r["sd"] for r in rows]))
+        plot = Plot(
+            "Leakage of an unlit patch",
+            "side of the patch (projector px)",
+            "b",
+            (by_size, flat),
+            log_x=True,
+        )
+        return Measurement(facts, {"leakage": plot}, name="calibration")
+
+    def _of_size(self, size: int, b: float, b_sd: float) -> dict[str, Any]:
+        relative, spread = self._contrast[size]
+        contrast = (1 - b) * relative
+        leakage = (1 + b - contrast) / (1 + b + contrast)
+        slope = 2 * (1 + b) / (1 + b + contrast) ** 2
+        sd = float(np.hypot(b_sd, slope * (1 - b) * np.nan_to_num(spread)))
+        return {
+            "size": size,
+            "leakage": round(leakage, 5),
+            "sd": round(sd, 5),
+            "contrast": round(relative, 5),
+            "measurable": bool(relative >= _RESOLVED and sd <= _SURE),
+        }
+
+    def _uncertain_black(self, whole: Plane, good: Mask) -> float:
+        """What the rounding of counts may do to b, where it is the same in all samples."""
+        frames = max(1, self._references[Lighting.BLACK].frames)
+        mean = float(whole[good].mean(dtype=np.float64))
+        return 0.29 / mean / float(np.sqrt(frames))
+
+    def summary(self) -> dict[str, float]:
+        """Sizes so far."""
+        return {"sizes": float(len(self._contrast))}
