@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 LEASE_S = 10.0
 """A live view that nobody renews ends after this."""
 _DRAWING = "\x1b[?1049h\x1b[?25l"  # a screen of its own, without a cursor
-_DRAWN = "\x1b[?25h\x1b[?1049l"
+_DRAWN = "\x1b[0m\x1b[?25h\x1b[?1049l"
 
 
 class What(enum.StrEnum):
