@@ -151,8 +151,13 @@ class Rig:
     def require_ready(self) -> None:
         """Raise UmbraError(device_lost) naming the first device that is not ready."""
         self._need("camera")
+        for kind in dict.fromkeys(m.device.kind for m in self._members.values()):
+            self.require_kind(kind)
+
+    def require_kind(self, kind: str) -> None:
+        """Raise UmbraError(device_lost) naming a device of this kind that is not ready."""
         for member in self._members.values():
-            if member.health is not Health.READY:
+            if member.device.kind == kind and member.health is not Health.READY:
                 raise UmbraError(
                     Code.DEVICE_LOST,
                     f"{member.device.name} ({member.driver}) is {member.health}: {member.message}",

@@ -45,7 +45,10 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "keys": ("keys:app", "Make, authorise, list and revoke CURVE keys."),
     },
     "By hand": {
-        "preview": ("hand:preview", "The latest frame, in the terminal or as a picture."),
+        "preview": (
+            "preview:preview",
+            "Look through the camera, once or live.",
+        ),
         "show": ("show:app", "Project a pattern: white, black, off, checker ..."),
         "snap": ("hand:snap", "Take one frame and save it as PNG."),
         "camera": ("hand:camera", "Read or change the camera's settings."),
