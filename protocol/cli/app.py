@@ -24,6 +24,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "scan": ("scan:app", "Queue a scan: checkerboard, two-image, stick ..."),
         "calibrate": ("scan:calibrate", "Calibrate the rig: dark, noise, leak, tone, latency."),
         "verify": ("scan:verify", "Verify the separation at points, as the paper does (3.5)."),
+        "advise": ("scan:advise", "Which pattern, images and exposure this scene needs."),
         "watch": ("watch:watch", "Follow a run: progress, rate, time left."),
         "runs": ("runs:runs", "List runs, the newest first."),
         "run": ("runs:run", "One run in detail."),
