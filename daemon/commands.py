@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from daemon import __version__, measured, picture, products
+from daemon import __version__, discovery, measured, picture, products
 from daemon.config import RigConfig
+from daemon.doctor.examination import Doctor
 from daemon.logs import LogBook
 from daemon.manual import Manual
 from daemon.publisher import Publisher
@@ -42,6 +43,7 @@ class Commands:
         store: Store,
         config: RigConfig,
         viewfinder: Viewfinder,
+        doctor: Doctor,
         publisher: Publisher,
         book: LogBook,
         epoch: str,
@@ -52,6 +54,7 @@ class Commands:
         self._store = store
         self._config = config
         self._viewfinder = viewfinder
+        self._doctor = doctor
         self._publisher = publisher
         self._book = book
         self._epoch = epoch
@@ -62,6 +65,8 @@ class Commands:
             m.Hello: self._hello,
             m.GetStatus: self._status,
             m.GetDevices: self._devices,
+            m.Discover: self._discover,
+            m.Examine: self._examine,
             m.Submit: self._submit,
             m.GetQueue: self._queue,
             m.MoveQueued: self._move,
@@ -80,6 +85,12 @@ class Commands:
             m.Snap: self._snap,
             m.SetCamera: self._camera,
             m.SetLight: self._light,
+            m.GetStage: self._stage,
+            m.StageHome: self._stage_home,
+            m.StageMove: self._stage_move,
+            m.StageCircle: self._stage_circle,
+            m.StageStop: self._stage_stop,
+            m.StageUnlock: self._stage_unlock,
             m.Dark: self._dark,
             m.Lock: self._lock,
             m.RenewLock: self._renew,
@@ -142,6 +153,24 @@ class Commands:
 
     async def _devices(self, _: m.GetDevices, __: _Asked) -> Answer:
         return Answer(m.Devices(devices=self._rig.devices()))
+
+    async def _discover(self, command: m.Discover, asked: _Asked) -> Answer:
+        self._manual.admit(asked.token)
+        self._require_no_run()
+        searches = await discovery.discover(
+            command.drivers, command.timeout_s, self._config.devices, self._rig.devices()
+        )
+        return Answer(m.Discovered(searches=searches))
+
+    async def _examine(self, command: m.Examine, asked: _Asked) -> Answer:
+        doctor = self._doctor
+        if not command.passive:
+            self._require_hands(asked)
+        writes = self._runner.current is not None
+        checks = await asyncio.to_thread(doctor.look, run_writes=writes)
+        if not command.passive:
+            checks += await self._by_hand(asked, doctor.expose)
+        return Answer(m.Examined(checks=tuple(checks)))
 
     async def _log(self, command: m.GetLog, _: _Asked) -> Answer:
         return Answer(m.Log(records=self._book.records(command.run, command.limit)))
@@ -286,16 +315,23 @@ class Commands:
     # ------------------------------------------------------------ by hand
 
     async def _by_hand(self, asked: _Asked, act: Callable[[], T]) -> T:
+        self._require_hands(asked)
+        return await asyncio.to_thread(act)
+
+    def _require_hands(self, asked: _Asked) -> None:
+        """Raise UmbraError unless this client may use the devices by hand now."""
         self._manual.admit(asked.token)
         if self._estopped:
             raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
+        self._require_no_run()
+
+    def _require_no_run(self) -> None:
         current = self._runner.current
         if current is not None:
             raise UmbraError(
                 Code.BUSY,
                 f"{current.id} is using the devices; wait for it, or `umbra abort`",
             )
-        return await asyncio.to_thread(act)
 
     async def _show(self, command: m.Show, asked: _Asked) -> Answer:
         await self._by_hand(asked, lambda: self._manual.show(command.pattern, command.lease_s))
@@ -325,6 +361,35 @@ class Commands:
     async def _light(self, command: m.SetLight, asked: _Asked) -> Answer:
         await self._by_hand(asked, lambda: self._manual.light(command.name, command.on))
         return Answer(m.Done(message=f"{command.name} is {'on' if command.on else 'off'}"))
+
+    async def _stage(self, _: m.GetStage, __: _Asked) -> Answer:
+        return Answer(await asyncio.to_thread(self._manual.stage.status))
+
+    async def _stage_home(self, command: m.StageHome, asked: _Asked) -> Answer:
+        home = self._manual.stage.home
+        return Answer(await self._by_hand(asked, lambda: home(command.timeout_s)))
+
+    async def _stage_move(self, command: m.StageMove, asked: _Asked) -> Answer:
+        def move() -> m.StageStatus:
+            return self._manual.stage.move(command.x_mm, command.y_mm, command.feed_mm_s)
+
+        return Answer(await self._by_hand(asked, move))
+
+    async def _stage_circle(self, command: m.StageCircle, asked: _Asked) -> Answer:
+        def circle() -> m.StageStatus:
+            return self._manual.stage.circle(
+                command.centre_mm, command.radius_mm, command.feed_mm_s, command.turns
+            )
+
+        return Answer(await self._by_hand(asked, circle))
+
+    async def _stage_stop(self, _: m.StageStop, __: _Asked) -> Answer:
+        """Whoever holds the rig: to stop is never refused, but a run is aborted, not stopped."""
+        self._require_no_run()
+        return Answer(await asyncio.to_thread(self._manual.stage.stop))
+
+    async def _stage_unlock(self, _: m.StageUnlock, asked: _Asked) -> Answer:
+        return Answer(await self._by_hand(asked, self._manual.stage.unlock))
 
     async def _dark(self, _: m.Dark, asked: _Asked) -> Answer:
         await self._by_hand(asked, self._manual.end)

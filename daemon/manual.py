@@ -17,16 +17,19 @@ import numpy as np
 import structlog
 
 from daemon.devicethread import Session
+from daemon.manualstage import ManualStage
 from daemon.patterns import render
 from daemon.rig import SAFE_S, Rig
 from daemon.sequencer import CALL_S, SHOW_S
 from daemon.viewfinder import Viewfinder
 from drivers.base import Acquisition, Camera, CameraInfo, CameraSettings, DeviceError, Frame
 from protocol.errors import Code, UmbraError
-from protocol.messages import LockInfo
+from protocol.messages import AnyEvent, LockInfo
 from protocol.patterns import AnyPattern
 
 _FRAME_S = 2.0
+_LIGHT_S = 600.0
+"""How long a light that was switched on by hand stays on when nobody asks again."""
 OWNER = "manual work"
 
 log = structlog.get_logger(__name__)
@@ -44,8 +47,16 @@ class _Lock:
 class Manual:
     """What people do without a scan. Device calls block: never call them from the loop."""
 
-    def __init__(self, rig: Rig, viewfinder: Viewfinder, on_change: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        viewfinder: Viewfinder,
+        on_change: Callable[[], None],
+        publish: Callable[[AnyEvent], None],
+    ) -> None:
+        """`on_change` and `publish` must be safe to call from any thread."""
         self._rig = rig
+        self.stage = ManualStage(rig, self.use, self._keep, publish)
         self._viewfinder = viewfinder
         self._on_change = on_change
         self._mutex = threading.RLock()
@@ -140,6 +151,7 @@ class Manual:
 
     def make_way(self) -> None:
         """Before a scan: end manual work, and wait for the safe state."""
+        self.stage.finish()
         if self.active:
             self.end()
 
@@ -151,7 +163,8 @@ class Manual:
         self._rig.leave(session)
         return futures
 
-    def _use(self, lease_s: float) -> Session:
+    def use(self, lease_s: float) -> Session:
+        """Begin manual work, or join it, for at least `lease_s`. Raises UmbraError(busy)."""
         with self._mutex:
             if not self.active:
                 self._session = self._rig.take(OWNER)
@@ -159,6 +172,12 @@ class Manual:
             assert self._session is not None
             self._dark_at = max(self._dark_at, time.monotonic() + lease_s)
             return self._session
+
+    def _keep(self, session: Session, lease_s: float) -> None:
+        """Prolong manual work, unless it has ended."""
+        with self._mutex:
+            if self._session is session:
+                self._dark_at = max(self._dark_at, time.monotonic() + lease_s)
 
     # ------------------------------------------------------------ acts
 
@@ -171,7 +190,7 @@ class Manual:
             )
         with self._mutex:
             self._dark_at = 0.0
-            session = self._use(lease_s)
+            session = self.use(lease_s)
         info = projector.device.info()
         image = render(pattern, info.width, info.height)
         projector.call(lambda p: p.show(image), SHOW_S, session)
@@ -182,14 +201,14 @@ class Manual:
         if thread is None:
             known = ", ".join(self._rig.lights) or "none"
             raise UmbraError(Code.DEVICE_MISSING, f"no light {name!r}: this rig has {known}")
-        session = self._use(_FRAME_S)
+        session = self.use(_LIGHT_S if on else _FRAME_S)
         thread.call(lambda light: light.set(on), CALL_S, session)
 
     def snap(self) -> tuple[Frame, CameraInfo]:
         """Take one frame as things are. Raises UmbraError, DeviceError."""
         camera = self._rig.camera
         was_active = self.active
-        session = self._use(_FRAME_S)
+        session = self.use(_FRAME_S)
 
         def take(cam: Camera) -> tuple[Frame, CameraInfo]:
             info = cam.info()
@@ -220,7 +239,7 @@ class Manual:
         if wanted == CameraSettings():
             return camera.device.settings()
         was_active = self.active
-        session = self._use(_FRAME_S)
+        session = self.use(_FRAME_S)
         try:
             return camera.call(lambda c: c.configure(wanted), CALL_S, session)
         finally:

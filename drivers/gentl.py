@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from genicam import genapi, gentl
-from harvesters.core import Callback, Harvester, ImageAcquirer
 
 from drivers.base import Context, DeviceLost, DeviceRefused, DeviceTimeout, Identity
 from drivers.sfnc import Nodes, SfncCamera, SfncOptions, Value
 from drivers.streaming import Buffer
+
+with warnings.catch_warnings():  # it changes the whole program's filters
+    from harvesters.core import Callback, Harvester, ImageAcquirer
 
 PRODUCERS = "GENICAM_GENTL64_PATH"  # where vendors' installers say that their producers are
 READABLE = 2  # access modes from here on: write only, read only, read and write

@@ -88,16 +88,14 @@ class GphotoCamera(Camera):
         """See Device. Opens each camera for a moment to ask for its serial number."""
         found = []
         for model, port in _attached():
-            camera = _opened(model, port)
-            serial = Config(camera).text("serialnumber")
-            camera.exit()
-            found.append(
-                {
-                    "model": model,
-                    "serial": serial,
-                    "options": {"driver": "gphoto2", "serial": serial},
-                }
-            )
+            try:
+                camera = _opened(model, port)
+                serial = Config(camera).text("serialnumber")
+                camera.exit()
+            except gp.GPhoto2Error:
+                serial = ""  # somebody else has opened it, perhaps the rig itself
+            options = {"driver": "gphoto2", **({"serial": serial} if serial else {})}
+            found.append({"model": model, "serial": serial, "options": options})
         return found
 
     # ------------------------------------------------------------ life

@@ -45,7 +45,7 @@ from drivers.grbl_motion import (
     line,
     machine_travel,
 )
-from drivers.serialport import SerialPort
+from drivers.serialport import SerialPort, attached
 from drivers.track import Arc, Point, Track
 
 ACCEPT_S = 2.0  # a first motion line is acknowledged within milliseconds
@@ -60,6 +60,16 @@ def _stands(report: grbl.Report) -> bool:
     if report.state == "Door":
         return report.substate in {0, 1}
     return report.state in {"Alarm", "Sleep", "Check"}
+
+
+CHIPS = {
+    (0x2341, None), (0x2A03, None),  # Arduino
+    (0x1A86, None),  # WCH: CH340, CH9102
+    (0x10C4, 0xEA60),  # CP210x
+    (0x0403, 0x6001), (0x0403, 0x6010), (0x0403, 0x6015),  # FTDI
+    (0x0483, 0x5740),  # STM32: grblHAL
+}  # fmt: skip
+"""USB serial chips that motion controllers carry; they may carry other firmware as well."""
 
 
 class GrblOptions(Options, frozen=True, kw_only=True):
@@ -101,6 +111,11 @@ class GrblStage(Stage):
         self._identity: Identity | None = None
         self._settings: dict[int, float] = {}
         self._build = grbl.Build()
+
+    @classmethod
+    def discover(cls) -> list[dict[str, Any]]:
+        """See Device. Ports that may lead to a Grbl; none is opened, which would reset it."""
+        return attached(CHIPS)
 
     # ------------------------------------------------------------ life
 

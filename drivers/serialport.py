@@ -17,6 +17,7 @@ import errno
 import os
 import threading
 from collections import deque
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from drivers.clock import Clock
 
 POLL_S = 0.1  # how soon a reader notices that it was closed
 WRITE_S = 0.5  # the line takes 5 kB in this time at 115200 baud: longer means that nobody reads
+BY_ID = Path("/dev/serial/by-id")
+BY_SOCKET = Path("/dev/umbra")  # where systemd/udev/71-umbra.rules puts links
 LONGEST_LINE = 1024  # bytes; more without a line end is noise
 
 
@@ -57,6 +60,34 @@ def usb_ports() -> dict[str, UsbIdentity]:
         for p in list_ports.comports()
         if p.vid is not None
     }
+
+
+def attached(chips: Collection[tuple[int, int | None]]) -> list[dict[str, Any]]:
+    """The USB serial ports whose (vendor, product) is among `chips` (product None: any), as
+    `Device.discover` gives them. Nothing is opened: opening resets many a board."""
+    found = []
+    for port in sorted(list_ports.comports()):
+        if port.vid is None or not {(port.vid, port.pid), (port.vid, None)} & set(chips):
+            continue
+        serial_number = port.serial_number or ""
+        found.append(
+            {
+                "model": port.product or port.description or f"{port.vid:04x}:{port.pid:04x}",
+                "serial": serial_number,
+                "options": {"port": _stable_name(str(port.device), port, serial_number)},
+            }
+        )
+    return found
+
+
+def _stable_name(path: str, port: Any, serial_number: str) -> str:
+    """A name that stays: by-id needs a serial number, else two boards of a kind share one."""
+    for folder in [BY_ID] if serial_number else [BY_SOCKET]:
+        for link in sorted(folder.glob("*")):
+            if os.path.realpath(link) == os.path.realpath(path):
+                return str(link)
+    usb = f"usb:{port.vid:04x}:{port.pid:04x}"
+    return f"{usb}:{serial_number}" if serial_number else usb
 
 
 class SerialPort:

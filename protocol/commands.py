@@ -36,6 +36,7 @@ from protocol.results import (
     run_of,
     runs_of,
     separation_of,
+    stage_of,
 )
 from protocol.scans import AnyScan
 
@@ -48,6 +49,10 @@ T = TypeVar("T")
 
 SLOW_S = 30.0
 """The least time-out of a command whose own work takes time: an exposure, a large array."""
+
+
+EXAMINE_S = 180.0
+"""An examination exposes, flips and writes: seconds, and a minute with devices that time out."""
 
 
 class command(Generic[P, T]):  # noqa: N801  (a decorator, as property is)
@@ -108,6 +113,22 @@ class Commands:
     def devices(self) -> Ask[tuple[m.DeviceInfo, ...]]:
         """The devices in detail."""
         return Ask(m.GetDevices(), lambda a: expect(a.reply, m.Devices).devices)
+
+    @command
+    def discover(self, *drivers: str, timeout_s: float = 15.0) -> Ask[tuple[m.Search, ...]]:
+        """What is attached, asked of the drivers named, or of all. They broadcast on networks."""
+        return Ask(
+            m.Discover(drivers=drivers, timeout_s=timeout_s),
+            lambda a: expect(a.reply, m.Discovered).searches,
+            timeout_s + SLOW_S,
+        )
+
+    @command
+    def examine(self, *, passive: bool = False) -> Ask[tuple[m.Check, ...]]:
+        """Look for what is wrong with the rig (`umbra doctor`); `passive` exposes nothing."""
+        return Ask(
+            m.Examine(passive=passive), lambda a: expect(a.reply, m.Examined).checks, EXAMINE_S
+        )
 
     @command
     def submit(self, spec: AnyScan, *, first: bool = False) -> Ask[RunInfo]:
@@ -220,6 +241,45 @@ class Commands:
     def light(self, name: str, on: bool) -> Ask[str]:
         """Switch a light."""
         return Ask(m.SetLight(name=name, on=on), message_of)
+
+    @command
+    def stage(self) -> Ask[m.StageStatus]:
+        """Where the stage is and what it is doing."""
+        return Ask(m.GetStage(), stage_of)
+
+    @command
+    def stage_home(self, timeout_s: float = 60.0) -> Ask[m.StageStatus]:
+        """Begin to find the stage's origin; `stage` and the topic stage show the end."""
+        return Ask(m.StageHome(timeout_s=timeout_s), stage_of)
+
+    @command
+    def stage_move(self, x_mm: float, y_mm: float, feed_mm_s: float) -> Ask[m.StageStatus]:
+        """Begin to go straight to a point."""
+        return Ask(m.StageMove(x_mm=x_mm, y_mm=y_mm, feed_mm_s=feed_mm_s), stage_of, SLOW_S)
+
+    @command
+    def stage_circle(
+        self,
+        centre_mm: tuple[float, float],
+        radius_mm: float,
+        feed_mm_s: float,
+        turns: float | None = None,
+    ) -> Ask[m.StageStatus]:
+        """Begin to go round a circle; without `turns` until `stage_stop`."""
+        asked = m.StageCircle(
+            centre_mm=centre_mm, radius_mm=radius_mm, feed_mm_s=feed_mm_s, turns=turns
+        )
+        return Ask(asked, stage_of, SLOW_S)
+
+    @command
+    def stage_stop(self) -> Ask[m.StageStatus]:
+        """End every motion of the stage, whoever asked for it."""
+        return Ask(m.StageStop(), stage_of, SLOW_S)
+
+    @command
+    def stage_unlock(self) -> Ask[m.StageStatus]:
+        """Leave the stage's alarm without homing."""
+        return Ask(m.StageUnlock(), stage_of, SLOW_S)
 
     @command
     def dark(self) -> Ask[str]:

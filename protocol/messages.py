@@ -103,6 +103,15 @@ class StageState(enum.StrEnum):
     ALARM = "alarm"
 
 
+class Outcome(enum.StrEnum):
+    """What a check of `doctor` came to."""
+
+    OK = "ok"
+    WARNING = "warning"  # scans work, but not as well as they could
+    FAILED = "failed"  # scans fail, or lie
+    SKIPPED = "skipped"  # it could not be looked at
+
+
 # ---------------------------------------------------------------- facts
 
 
@@ -209,6 +218,33 @@ class CameraSettings(Fact, frozen=True, kw_only=True):
     ) = None
 
 
+class Found(Fact, frozen=True, kw_only=True):
+    """A device that is attached."""
+
+    model: str
+    serial: str
+    toml: str  # to paste into rig.toml
+    used_by: str = ""  # the rig's device that is this one already
+
+
+class Search(Fact, frozen=True, kw_only=True):
+    """What one driver found, or why it could not look."""
+
+    kind: str
+    driver: str
+    found: tuple[Found, ...] = ()
+    problem: str = ""  # with the remedy
+
+
+class Check(Fact, frozen=True, kw_only=True):
+    """One finding of `doctor`."""
+
+    name: str  # "disk: speed": what was looked at
+    outcome: Outcome
+    message: str
+    remedy: str = ""  # what to do
+
+
 # ---------------------------------------------------------------- commands
 
 
@@ -230,6 +266,28 @@ class GetStatus(Command, frozen=True, kw_only=True, tag="status"):
 
 class GetDevices(Command, frozen=True, kw_only=True, tag="devices"):
     """The devices in detail."""
+
+
+class Discover(Command, frozen=True, kw_only=True, tag="discover"):
+    """What is attached, driver by driver. Refused while a run uses the devices.
+
+    Vendors' libraries look for cameras by broadcasts on every network, so this happens only when
+    it is asked for, and by the drivers that are named, or else installed.
+    """
+
+    role: ClassVar[Role] = Role.OPERATOR
+    drivers: tuple[str, ...] = ()  # none named: every one that is installed
+    timeout_s: Annotated[float, Meta(gt=0, le=120)] = 15.0  # for each; they look side by side
+
+
+class Examine(Command, frozen=True, kw_only=True, tag="doctor"):
+    """Look for what is wrong with the rig. Exposes, as manual work: not while a run goes on.
+
+    `passive` leaves the devices alone, and is answered at any time.
+    """
+
+    role: ClassVar[Role] = Role.OPERATOR
+    passive: bool = False
 
 
 class Submit(Command, frozen=True, kw_only=True, tag="submit"):
@@ -443,10 +501,10 @@ class Unlock(Command, frozen=True, kw_only=True, tag="unlock"):
 
 
 AnyCommand = (
-    Hello | GetStatus | GetDevices | Submit | GetQueue | MoveQueued | Pause | Resume | Abort
-    | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct | GetLog | GetPreview | Show
-    | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove | StageCircle
-    | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
+    Hello | GetStatus | GetDevices | Discover | Examine | Submit | GetQueue | MoveQueued
+    | Pause | Resume | Abort | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct
+    | GetLog | GetPreview | Show | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove
+    | StageCircle | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
 )  # fmt: skip
 
 
@@ -491,6 +549,18 @@ class Devices(Reply, frozen=True, kw_only=True, tag="devices"):
     """Answer to `devices`."""
 
     devices: tuple[DeviceInfo, ...]
+
+
+class Discovered(Reply, frozen=True, kw_only=True, tag="discovered"):
+    """Answer to `discover`."""
+
+    searches: tuple[Search, ...]
+
+
+class Examined(Reply, frozen=True, kw_only=True, tag="examined"):
+    """Answer to `doctor`: the findings in the order in which they are best repaired."""
+
+    checks: tuple[Check, ...]
 
 
 class Run(Reply, frozen=True, kw_only=True, tag="run"):
@@ -564,14 +634,16 @@ class Done(Reply, frozen=True, kw_only=True, tag="done"):
 
 
 AnyReply = (
-    Welcome | Status | Devices | Run | Runs | Result | ProductPart | Log | Picture | Camera
-    | StageStatus | Locked | Done
+    Welcome | Status | Devices | Discovered | Examined | Run | Runs | Result | ProductPart | Log
+    | Picture | Camera | StageStatus | Locked | Done
 )  # fmt: skip
 
 ANSWERS: dict[type[Command], type[Reply]] = {
     Hello: Welcome,
     GetStatus: Status,
     GetDevices: Devices,
+    Discover: Discovered,
+    Examine: Examined,
     Submit: Run,
     GetQueue: Runs,
     MoveQueued: Runs,
@@ -650,6 +722,15 @@ class RigChanged(EventBody, frozen=True, kw_only=True, tag="rig-changed"):
     reason: str = ""
 
 
+class StageChanged(EventBody, frozen=True, kw_only=True, tag="stage-changed"):
+    """The stage is moved by hand: told a few times a second, and when it has come to rest."""
+
+    topic: ClassVar[str] = "stage"
+    state: StageState
+    position_mm: tuple[float, float] | None  # None while it is unknown
+    detail: str = ""  # why it stopped short
+
+
 class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
     """A small picture of the latest frame or separation. Array: `preview` (uint8, RGB)."""
 
@@ -659,7 +740,10 @@ class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
     facts: dict[str, Any] = {}
 
 
-AnyEvent = RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | PreviewTaken
+AnyEvent = (
+    RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | StageChanged
+    | PreviewTaken
+)  # fmt: skip
 
 
 # ---------------------------------------------------------------- envelopes

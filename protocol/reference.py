@@ -369,7 +369,7 @@ their own {PREVIEWS_HWM} previews; they ask when they have heard nothing for {SI
 ## States
 
 """
-    for states in (m.RunState, m.RigState, m.Health, m.StageState, m.Role):
+    for states in (m.RunState, m.RigState, m.Health, m.StageState, m.Outcome, m.Role):
         yield from _enum(states)
     yield "## Commands\n"
     yield "| command | least role | answer | |"

@@ -99,6 +99,11 @@ def runs_of(answer: Answer) -> tuple[RunInfo, ...]:
     return expect(answer.reply, m.Runs).runs
 
 
+def stage_of(answer: Answer) -> m.StageStatus:
+    """Of an answer about the stage."""
+    return expect(answer.reply, m.StageStatus)
+
+
 def message_of(answer: Answer) -> str:
     """What the daemon says where there is nothing more to say."""
     return expect(answer.reply, m.Done).message

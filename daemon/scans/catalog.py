@@ -12,6 +12,7 @@ from daemon.scans.calibrate_noise import NoiseMethod
 from daemon.scans.calibrate_tone import ToneMethod
 from daemon.scans.checkerboard import CheckerboardMethod
 from daemon.scans.gray_code import GrayCodeMethod
+from daemon.scans.mesh import MeshMethod
 from daemon.scans.method import Bench, Method, Unsuitable
 from daemon.scans.random_binary import RandomBinaryMethod
 from daemon.scans.single_image import SingleImageMethod
@@ -32,6 +33,7 @@ from protocol.scans import (
     CalibrateTone,
     Checkerboard,
     GrayCode,
+    Mesh,
     RandomBinary,
     RandomPhase,
     SingleImage,
@@ -48,6 +50,7 @@ _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     Checkerboard: CheckerboardMethod,
     TwoImage: TwoImageMethod,
     Stick: StickMethod,
+    Mesh: MeshMethod,
     Sinusoid: SinusoidMethod,
     RandomPhase: RandomPhaseMethod,
     GrayCode: GrayCodeMethod,

@@ -55,10 +55,36 @@ class Expose:
 
 
 @dataclass(frozen=True, slots=True)
+class Circle:
+    """A motion of the stage: round and round, without an end of its own."""
+
+    centre_mm: tuple[float, float]
+    radius_mm: float
+    feed_mm_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """A motion of the stage: straight to each point in turn; it ends at the last."""
+
+    points_mm: tuple[tuple[float, float], ...]
+    feed_mm_s: float
+
+
+Motion = Circle | Sweep
+
+
+@dataclass(frozen=True, slots=True)
 class Watch:
-    """A step: let the camera stream, `frames` of them or (None) to the end of a recording."""
+    """A step: let the camera stream, `frames` of them or (None) to the end of a recording, or until
+    the method says `enough`, or its motion ends.
+
+    `lights` are switched on before; the stage is homed if it must be, and moves meanwhile.
+    """
 
     frames: int | None
+    motion: Motion | None = None
+    lights: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +135,11 @@ class Method(ABC, Generic[S]):
     @abstractmethod
     def estimator(self) -> Estimator:
         """A fresh estimator for this scan."""
+
+    def enough(self, summary: Mapping[str, float], seconds: float) -> str:
+        """Why a video may end now, `seconds` after it began; "": it goes on."""
+        del summary, seconds
+        return ""
 
     def conclude(self, components: Components) -> Components:
         """The last word on the components before they are kept (masks that need the whole)."""

@@ -26,6 +26,7 @@ REFERENCES: dict[Reference, tuple[AnyPattern | None, Lighting]] = {
     Reference.AMBIENT: (None, Lighting.AMBIENT),
     Reference.BLACK: (BLACK, Lighting.BLACK),
     Reference.WHITE: (WHITE, Lighting.WHITE),
+    Reference.OPEN: (None, Lighting.OPEN),
 }
 
 

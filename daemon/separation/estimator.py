@@ -23,6 +23,7 @@ class Lighting(enum.StrEnum):
     AMBIENT = "ambient"  # off
     BLACK = "black"  # showing black: b of it leaks
     WHITE = "white"  # showing white
+    OPEN = "open"  # in full, with no occluder before it
 
 
 class Observation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

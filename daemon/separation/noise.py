@@ -8,6 +8,7 @@ an upper bound (`from_picture`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Any
 
 import cv2
@@ -41,6 +42,15 @@ class Noise:
         """Standard deviation at each sample's level: float32, same shape; linear between levels."""
         return np.asarray(np.interp(counts, self.levels, self.deviations), dtype=np.float32)
 
+    def of_a_sensor(self) -> Noise:
+        """The same, with no level noisier than a linear sensor can be: its variance a + b x level
+        (read and shot noise) is bounded by that of any other level. What is beyond it is motion.
+        """
+        at, found = np.asarray(self.levels), np.asarray(self.deviations)
+        grown = np.maximum(np.sqrt(at[:, None] / at[None, :]), 1.0)
+        bounded = np.min(found[None, :] * grown, axis=1)
+        return Noise(self.levels, tuple(float(d) for d in bounded))
+
     @property
     def typical(self) -> float:
         """The median over levels, for people."""
@@ -48,14 +58,17 @@ class Noise:
 
 
 class TemporalNoise:
-    """Noise from pairs of frames in which most of the scene was the same.
+    """Noise from pairs of frames in which part of the scene was the same.
 
     Differences are counted by level and size; the median of a level's tells its noise, whatever
-    moved in less than half of the picture. Memory: one small table.
+    moved in less than half of the picture. `quantile` below .5 withstands more motion, and is
+    coarser. Memory: one small table.
     """
 
-    def __init__(self, full_scale: int) -> None:
+    def __init__(self, full_scale: int, quantile: float = 0.5) -> None:
         self._full_scale = full_scale
+        self._quantile = quantile
+        self._scale = 1.0 / NormalDist().inv_cdf(0.5 + quantile / 2.0)
         self._table = np.zeros((_LEVELS, _BINS), dtype=np.int64)
         self.pairs = 0
 
@@ -78,19 +91,19 @@ class TemporalNoise:
         for index, row in enumerate(self._table):
             if row.sum() < _ENOUGH:
                 continue
-            found = _MAD * _median_difference(row) / np.sqrt(2.0)
+            found = self._scale * _difference(row, self._quantile) / np.sqrt(2.0)
             levels.append((index + 0.5) * (self._full_scale + 1) / _LEVELS)
             deviations.append(float(max(found, _ROUNDING)))
         return Noise(tuple(levels), tuple(deviations)) if levels else None
 
 
-def _median_difference(row: NDArray[np.int64]) -> float:
-    """The median of a row of the table; differences of whole counts stand for ± half a count."""
+def _difference(row: NDArray[np.int64], quantile: float) -> float:
+    """A quantile of a row of the table; differences of whole counts stand for ± half a count."""
     edges = np.exp2(np.arange(_BINS + 1) / _PER_OCTAVE) - 1.0
     share = np.cumsum(row) / row.sum()
-    at = int(np.searchsorted(share, 0.5))
+    at = int(np.searchsorted(share, quantile))
     before = share[at - 1] if at else 0.0
-    within = (0.5 - before) / (share[at] - before)
+    within = (quantile - before) / (share[at] - before)
     # a bin holds at most one whole count where it is narrow: spread it over ± half a count
     low, high = edges[at], edges[at + 1]
     if high - low < 1.0:

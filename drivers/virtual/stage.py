@@ -29,6 +29,7 @@ from drivers.virtual.timeline import Timeline
 Positive = Annotated[float, Meta(gt=0)]
 Travel = tuple[float, float]
 ROUNDING_MM = 1e-9
+ENDLESS_TURNS = 1e6
 
 
 class StageOptions(VirtualOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -208,9 +209,11 @@ class VirtualStage(VirtualDevice, Stage):
             self._plan(Line(here, (x_mm, y_mm)), feed_mm_s)
 
     def circle(self, centre_mm: XY, radius_mm: float, feed_mm_s: float, turns: float) -> None:
-        """See Stage. It goes straight to the first point, if it is not there."""
+        """See Stage. It goes straight to the first point, if it is not there; `turns` may be inf:
+        a million, then."""
         self._begin("circle")
-        if not (radius_mm > 0 and turns > 0 and math.isfinite(turns)):
+        turns = min(turns, ENDLESS_TURNS)
+        if not (radius_mm > 0 and turns > 0):
             raise DeviceRefused(
                 self.name, "circle", f"radius {radius_mm:g}, {turns:g} turns", "both are above 0"
             )
@@ -229,6 +232,15 @@ class VirtualStage(VirtualDevice, Stage):
         """See Stage."""
         self._begin("hold")
         self._hold()
+
+    def stop(self) -> None:
+        """See Stage. The position stays known."""
+        self._begin("stop")
+        self._hold()
+        with self.bench.lock:
+            self._kept.clear()
+            if self._state is StageState.HELD:
+                self._state = StageState.IDLE
 
     def resume(self) -> None:
         """See Stage."""

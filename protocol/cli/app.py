@@ -37,6 +37,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "The rig": {
         "status": ("rig:status", "What the rig is doing now."),
         "devices": ("rig:devices", "The devices and their health."),
+        "doctor": ("doctor:doctor", "What is wrong with the rig, and what to do about it."),
         "methods": ("rig:methods", "The scan methods that the daemon knows."),
         "log": ("rig:log", "The last log records of a run, or of the daemon."),
         "stop": ("rig:stop", "Emergency stop: safe state now, until `umbra reset`."),
@@ -49,6 +50,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "snap": ("hand:snap", "Take one frame and save it as PNG."),
         "camera": ("hand:camera", "Read or change the camera's settings."),
         "light": ("hand:light", "Switch a light on or off."),
+        "stage": ("stage:app", "Where the stage is; home, move, circle, stop, unlock."),
     },
 }
 

@@ -29,7 +29,8 @@ COLOURS = {
     "ready": "green", "done": "green", "idle": "green", "running": "cyan", "scanning": "cyan",
     "finishing": "cyan", "queued": "blue", "manual": "blue", "paused": "yellow",
     "interrupted": "yellow", "aborted": "yellow", "lost": "red", "fault": "red", "stuck": "red",
-    "failed": "red", "estopped": "red", "stopping": "yellow",
+    "failed": "red", "estopped": "red", "stopping": "yellow", "homing": "cyan", "moving": "cyan",
+    "held": "yellow", "alarm": "red", "ok": "green", "warning": "yellow",
 }  # fmt: skip
 
 

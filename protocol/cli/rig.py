@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
 
 from protocol.cli.link import Json, Keys, Rig, RunId, connect
-from protocol.cli.output import on_terminal, print_facts, print_json, print_table, seconds, size
+from protocol.cli.output import (
+    on_terminal,
+    print_facts,
+    print_json,
+    print_table,
+    say,
+    seconds,
+    size,
+)
 from protocol.cli.words import frames, method
-from protocol.messages import DeviceInfo, Devices, Done, Log, Status
+from protocol.errors import Code, UmbraError
+from protocol.messages import DeviceInfo, Devices, Discovered, Done, Log, Search, Status
 
 
 def status(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
@@ -52,11 +62,39 @@ def _status_lines(now: Status, server: str) -> list[tuple[str, str]]:
     return lines
 
 
-def devices(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
+def devices(
+    *,
+    drivers: Annotated[
+        list[str] | None, typer.Argument(metavar="[DRIVER]...", help="With --scan: only these.")
+    ] = None,
+    scan: Annotated[
+        bool, typer.Option("--scan", help="What is attached, with the TOML to paste.")
+    ] = False,
+    timeout_s: Annotated[
+        float, typer.Option("--timeout", min=0.1, max=120, help="With --scan: for each driver.")
+    ] = 15.0,
+    rig: Rig = None,
+    keys: Keys = None,
+    as_json: Json = False,
+) -> None:
     """The devices: health, model, and what their drivers say of them.
 
-    --json: a Devices.
+    --scan looks for attached devices on the rig's machine, in the rig or not. Vendors' libraries
+    look for cameras by broadcasts on every network of that machine: name the drivers to ask
+    (umbra devices --scan grbl) where that is not welcome.
+
+    --json: a Devices; with --scan a Discovered.
     """
+    if scan:
+        with connect(rig, keys) as client:
+            searches = client.discover(*(drivers or ()), timeout_s=timeout_s)
+        if as_json:
+            print_json(Discovered(searches=searches))
+        else:
+            _print_searches(searches)
+        return
+    if drivers:
+        raise UmbraError(Code.BAD_REQUEST, "drivers are named with --scan only", "--scan")
     with connect(rig, keys) as client:
         found = client.devices()
     if as_json:
@@ -69,6 +107,21 @@ def devices(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
             for d in found
         ],
     )
+
+
+def _print_searches(searches: Sequence[Search]) -> None:
+    """What was found as TOML with comments, to paste; who could not look as remarks."""
+    for search in searches:
+        for device in search.found:
+            serial = f", serial {device.serial}" if device.serial else ""
+            use = f" (in use: {device.used_by})" if device.used_by else ""
+            print(f"# {device.model}{serial}{use}\n{device.toml}")
+    nothing = [s.driver for s in searches if not s.found and not s.problem]
+    if nothing:
+        say(f"nothing attached: {', '.join(nothing)}")
+    for search in searches:
+        if search.problem:
+            say(f"{search.kind} {search.driver}: {search.problem}")
 
 
 def _device_facts(device: DeviceInfo) -> str:

@@ -26,7 +26,10 @@ from protocol.scans import AnySeparation, Reference
 if TYPE_CHECKING:
     from protocol.client import Client
 
-LIVE = {"exposure_us", "gain", "references"}
+LIVE = {
+    *("exposure_us", "gain", "references", "lights", "frame_rate_hz", "feed_mm_s"),
+    *("coverage", "time_limit_s", "sweeps", "sweep_mm", "radius_mm", "centre_mm"),
+}
 """Fields that are no options here: the photographs have them, or the files given say them."""
 OPTIONS = union_options(METHODS, without=LIVE)
 
@@ -58,6 +61,7 @@ def _separate(
     black_frame: Annotated[Path | None, _frame("with the projector showing black")] = None,
     white_frame: Annotated[Path | None, _frame("with the projector showing white")] = None,
     ambient_frame: Annotated[Path | None, _frame("with the source off")] = None,
+    open_frame: Annotated[Path | None, _frame("with no occluder before the source (mesh)")] = None,
     bayer: Annotated[
         Bayer | None, typer.Option(help="The images are a raw colour mosaic that begins so.")
     ] = None,
@@ -79,6 +83,7 @@ def _separate(
         Reference.BLACK: black_frame,
         Reference.WHITE: white_frame,
         Reference.AMBIENT: ambient_frame,
+        Reference.OPEN: open_frame,
     }
     first = {kind: file.absolute() for kind, file in shots.items() if file is not None}
     spec = spec_of(method, given, references=list(first))

@@ -256,3 +256,40 @@ def test_a_camera_that_dies_is_lost_and_comes_back(bench: Bench) -> None:
     cam.start(Acquisition.FREE)
     assert not grab(cam).incomplete
     cam.close()
+
+
+@pytest.fixture
+def in_process() -> Iterator[None]:
+    """Aravis's fake camera within this process, and no other interface: nothing is broadcast."""
+    from gi.repository import Aravis
+
+    others = [
+        Aravis.get_interface_id(i)
+        for i in range(Aravis.get_n_interfaces())
+        if Aravis.get_interface_id(i) != "Fake"
+    ]
+    for interface in others:
+        Aravis.disable_interface(interface)
+    Aravis.enable_interface("Fake")
+    yield
+    Aravis.disable_interface("Fake")
+    for interface in others:
+        Aravis.enable_interface(interface)
+
+
+@pytest.mark.usefixtures("in_process")
+def test_it_is_found_by_serial_number() -> None:
+    (found,) = AravisCamera.discover()
+    options = dict(found["options"])
+    assert options.pop("driver") == "aravis"
+    cam = make(address="", **options)
+    assert cam.connect().serial == found["serial"]
+    cam.start(Acquisition.FREE)
+    assert grab(cam).sequence == 0
+    cam.check()
+    cam.close()
+    only = make(address="")
+    assert only.connect().serial == found["serial"]
+    only.close()
+    with pytest.raises(DeviceLost, match=rf"no camera GV77 \(found: {found['serial']}\)"):
+        make(address="", serial="GV77").connect()

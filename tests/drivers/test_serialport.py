@@ -12,15 +12,20 @@ import tty
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import serial
 from serial import rfc2217
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
+from drivers import serialport
 from drivers.base import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import RealClock
+from drivers.grbl import GrblStage
 from drivers.serialport import LONGEST_LINE, LineReader, SerialPort
+from drivers.tmcl import TmclStage
 
 pytestmark = pytest.mark.timeout(10)
 
@@ -274,3 +279,41 @@ def test_lines_carry_the_time_of_their_first_byte(ptys: list[Pty]) -> None:
     assert isinstance(reader.error, DeviceLost)
     reader.close()
     port.close()
+
+
+def test_attached_boards_have_names_that_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def port(device: str, vid: int | None, pid: int, number: str | None) -> Any:
+        info = ListPortInfo(device)
+        info.vid, info.pid, info.serial_number, info.product = vid, pid, number, "a board"
+        return info
+
+    nodes = {name: tmp_path / name for name in ("ttyUSB0", "ttyUSB1", "ttyACM0", "ttyS0")}
+    for node in nodes.values():
+        node.touch()
+    by_id, by_socket = tmp_path / "by-id", tmp_path / "umbra"
+    for folder in (by_id, by_socket):
+        folder.mkdir()
+    (by_id / "usb-FTDI_A50285BI").symlink_to(nodes["ttyUSB0"])
+    (by_id / "usb-1a86_USB_Serial").symlink_to(nodes["ttyUSB1"])  # shared by all of its kind
+    (by_socket / "serial-at-2").symlink_to(nodes["ttyUSB1"])
+    monkeypatch.setattr(serialport, "BY_ID", by_id)
+    monkeypatch.setattr(serialport, "BY_SOCKET", by_socket)
+    monkeypatch.setattr(
+        list_ports,
+        "comports",
+        lambda: [
+            port(str(nodes["ttyUSB0"]), 0x0403, 0x6001, "A50285BI"),
+            port(str(nodes["ttyUSB1"]), 0x1A86, 0x7523, None),
+            port(str(nodes["ttyACM0"]), 0x2A3C, 0x0100, "T1"),
+            port(str(nodes["ttyS0"]), None, 0, None),
+        ],
+    )
+    assert [d["options"]["port"] for d in GrblStage.discover()] == [
+        str(by_id / "usb-FTDI_A50285BI"),
+        str(by_socket / "serial-at-2"),
+    ]
+    assert [(d["serial"], d["options"]["port"]) for d in TmclStage.discover()] == [
+        ("T1", "usb:2a3c:0100:T1")
+    ]

@@ -27,6 +27,12 @@ from protocol.wire import Arrays, decode, encode, headers
 T = TypeVar("T")
 UTC = "2026-01-01T00:00:00Z"
 Frames = list[bytes]
+STAGE = m.StageStatus(
+    state=m.StageState.IDLE,
+    position_mm=(1.0, 2.0),
+    travel_mm=((0.0, 100.0), (0.0, 50.0)),
+    max_feed_mm_s=20.0,
+)
 _requests = msgspec.json.Decoder(m.Request)
 
 
@@ -56,6 +62,7 @@ class FakeRig:
             "direct": np.arange(12, dtype=np.float32).reshape(3, 4),
             "global": np.full((3, 4), 2.5, np.float32),
         }
+        self.checks: tuple[m.Check, ...] = ()
         self.files: dict[str, bytes] = {}
         self.runs: dict[str, RunInfo] = {}
         self.lock: m.Locked | None = None
@@ -272,6 +279,17 @@ class FakeRig:
                 return m.Picture(facts={"saturated": 0}), {name: np.zeros((4, 4, 3), np.uint8)}
             case m.SetCamera(settings=settings):
                 return m.Camera(settings=settings), {}
+            case (
+                m.GetStage() | m.StageHome() | m.StageMove() | m.StageCircle() | m.StageStop()
+                | m.StageUnlock()
+            ):  # fmt: skip
+                return STAGE, {}
+            case m.Discover(drivers=drivers):
+                return m.Discovered(
+                    searches=tuple(m.Search(kind="camera", driver=d) for d in drivers)
+                ), {}
+            case m.Examine():
+                return m.Examined(checks=self.checks), {}
             case m.Lock(lease_s=lease_s):
                 self.lock = m.Locked(token=uuid.uuid4().hex, lease_s=lease_s)
                 return self.lock, {}

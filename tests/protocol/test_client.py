@@ -27,7 +27,7 @@ from protocol.messages import GetResult
 from protocol.patterns import WHITE
 from protocol.results import separation_of
 from protocol.scans import Checkerboard
-from tests.protocol.fake import FakeRig
+from tests.protocol.fake import STAGE, FakeRig
 
 Connect = Callable[..., Client]
 
@@ -58,6 +58,10 @@ def test_each_command_has_a_method_and_the_answer_it_names(fake: FakeRig, rig: C
     assert rig.log() == ({"event": "hello"},)
     assert rig.preview().pixels.shape == rig.snap().pixels.shape == (4, 4, 3)
     assert rig.camera(gain=2.0).gain == 2.0
+    assert rig.stage() == rig.stage_home() == rig.stage_move(1, 2, 3) == STAGE
+    assert rig.stage_circle((9, 9), 3, 2) == rig.stage_stop() == rig.stage_unlock() == STAGE
+    assert rig.discover("pylon") == (m.Search(kind="camera", driver="pylon"),)
+    assert rig.examine() == ()
     rig.token = rig.lock("me").token
     assert rig.renew_lock().lease_s == 10.0
     assert rig.unlock() == ""

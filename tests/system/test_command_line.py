@@ -162,10 +162,13 @@ def _listens(path: Path) -> bool:
 
 def test_separate_finds_the_components(tmp_path: Path) -> None:
     shots = write_shifts(tmp_path / "shots")
-    done = umbra("separate", shots, "--method", "checkerboard", "-o", "out", cwd=tmp_path)
+    done = umbra(
+        "separate", shots, "--method", "checkerboard", "--estimator", "maxmin", "-o", "out",
+        cwd=tmp_path,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     out = tmp_path / "out"
-    assert sorted(p.name for p in out.iterdir()) == PRODUCTS
+    assert set(PRODUCTS) <= {p.name for p in out.iterdir()}
     assert [Path(line).name for line in done.stdout.splitlines()][:2] == PRODUCTS[:2]
     direct, global_ = scene()
     assert np.abs(read(out / "direct.tiff") - direct).max() <= 1.01  # two roundings to 8 bit

@@ -1,0 +1,148 @@
+"""A mesh that goes round in small circles between the source and the scene (§4.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+from daemon.scans.method import Bench, Circle, Unsuitable
+from daemon.scans.occluder import OccluderMethod
+from daemon.separation.estimator import Components, Estimator
+from daemon.separation.mesh import MeshOccluder
+from protocol import mesh as geometry
+from protocol.scans import Mesh, Reference
+
+_RATE_HZ = 30.0  # where neither the scan nor the camera says
+_EXPOSURE_S = 0.01
+
+
+class MeshMethod(OccluderMethod[Mesh]):
+    """Circles until every lit pixel was in full light and in the umbra.
+
+    Where the mesh's geometry is known, radius and feed are planned from it, and a request that
+    does worse is done all the same, with `warnings`.
+    """
+
+    name: ClassVar[str] = "mesh"
+    allowed: Mapping[Reference, str] = {
+        Reference.AMBIENT: "the source off",
+        Reference.OPEN: "no mesh before the source",
+    }
+
+    def __init__(self, spec: Mesh, bench: Bench) -> None:
+        self.warnings: tuple[str, ...] = ()
+        self._mesh = _mesh_of(spec)
+        wanted = spec.references or ()
+        live = not bench.camera.recorded
+        if live and Reference.OPEN in wanted:
+            raise Unsuitable(
+                "a rig cannot take the mesh away: an open frame goes with recordings "
+                "(umbra separate --open-frame)",
+                "$.references",
+            )
+        self.hole_fraction = spec.hole_fraction
+        if self.hole_fraction is None and self._mesh is not None:
+            self.hole_fraction = self._mesh.hole_fraction
+        if self.hole_fraction is None and not {Reference.AMBIENT, Reference.OPEN} <= {*wanted}:
+            raise Unsuitable(
+                "say the mesh's hole fraction (--hole-fraction), or its holes and pitch "
+                "(--hole-mm, --pitch-mm), or give an ambient and an open frame to measure it with",
+                "$.hole_fraction",
+            )
+        super().__init__(spec, bench, self._circle(spec, bench) if live else None)
+
+    def _circle(self, spec: Mesh, bench: Bench) -> Circle:
+        """The motion: as asked for, else as planned."""
+        stage = bench.stage
+        if stage is None:
+            raise Unsuitable(
+                "mesh needs a stage to move it, and this rig has none: name one under [stage] in "
+                "rig.toml"
+            )
+        (x0, x1), (y0, y1) = stage.travel_mm
+        centre = spec.centre_mm or ((x0 + x1) / 2.0, (y0 + y1) / 2.0)
+        radius, feed = spec.radius_mm, spec.feed_mm_s
+        if self._mesh is not None:
+            radius, feed = self._planned(self._mesh, spec, bench)
+        if radius is None:
+            raise Unsuitable(
+                "say the circle's radius (--radius-mm), or the mesh's holes and pitch (--hole-mm, "
+                "--pitch-mm) to have it planned",
+                "$.radius_mm",
+            )
+        feed = feed or math.tau * radius / 4.0  # a turn in four seconds
+        for axis, low, high, at in (("x", x0, x1, centre[0]), ("y", y0, y1, centre[1])):
+            if not low <= at - radius <= at + radius <= high:
+                raise Unsuitable(
+                    f"a circle of {radius:.3g} mm round {axis} = {at:g} leaves the stage's travel "
+                    f"of {low:g} to {high:g} mm (--centre-mm, --radius-mm)",
+                    "$.centre_mm",
+                )
+        return Circle(centre, radius, min(feed, stage.max_feed_mm_s))
+
+    def _planned(self, mesh: geometry.Mesh, spec: Mesh, bench: Bench) -> tuple[float, float]:
+        """Radius and feed: the spec's with warnings where the geometry says worse, else the best.
+
+        Raises Unsuitable where no circle covers every point.
+        """
+        assert bench.stage is not None
+        penumbra = geometry.penumbra_mm(spec.scene_mm or 0.0, source_deg=spec.source_deg)
+        rate = spec.frame_rate_hz or min(bench.camera.max_rate_hz or _RATE_HZ, _RATE_HZ)
+        exposure = spec.exposure_us * 1e-6 if spec.exposure_us else min(_EXPOSURE_S, 1.0 / rate)
+        try:
+            best = geometry.plan(
+                mesh,
+                penumbra=penumbra,
+                exposure_s=exposure,
+                frame_rate_hz=rate,
+                max_feed_mm_s=bench.stage.max_feed_mm_s,
+            )
+        except ValueError as error:
+            raise Unsuitable(str(error), "$.pitch_mm") from error
+        radius = spec.radius_mm or best.circle.radius_mm
+        asked = geometry.circle(mesh, radius, penumbra)
+        warnings = []
+        for part, what in ((asked.lit, "in full light"), (asked.unlit, "in the umbra")):
+            if part == 0.0:
+                warnings.append(
+                    f"a circle of {radius:.3g} mm leaves points that are never {what}; "
+                    f"{best.circle.radius_mm:.3g} mm leaves none"
+                )
+        if asked.leak > 0.0:
+            warnings.append(f"up to {asked.leak:.0%} of the source still reaches the umbra")
+        feed = spec.feed_mm_s or best.feed_mm_s * radius / best.circle.radius_mm
+        if feed > 2.0 * best.feed_mm_s * radius / best.circle.radius_mm:
+            warnings.append(
+                f"at {feed:.3g} mm/s the mesh goes {feed * exposure:.2g} mm in an exposure, or too "
+                f"few frames see a point in light; {best.feed_mm_s:.3g} mm/s is planned"
+            )
+        self.warnings = tuple(warnings)
+        return radius, feed
+
+    def estimator(self) -> Estimator:
+        """See `Method`."""
+        return MeshOccluder(
+            self.response,
+            hole_fraction=self.hole_fraction,
+            averaged=self.spec.estimator == "auto",
+        )
+
+    def conclude(self, components: Components) -> Components:
+        """See `Method`: with the warnings among the facts."""
+        if not self.warnings:
+            return components
+        return replace(components, facts={**components.facts, "warnings": list(self.warnings)})
+
+
+def _mesh_of(spec: Mesh) -> geometry.Mesh | None:
+    """The mesh, where its geometry is told. Raises Unsuitable."""
+    if spec.hole_mm is None and spec.pitch_mm is None:
+        return None
+    if spec.hole_mm is None or spec.pitch_mm is None:
+        raise Unsuitable("holes and pitch go together (--hole-mm, --pitch-mm)", "$.pitch_mm")
+    try:
+        return geometry.Mesh(spec.hole_mm, spec.pitch_mm, spec.grid)
+    except ValueError as error:
+        raise Unsuitable(str(error), "$.pitch_mm") from error

@@ -1,0 +1,146 @@
+"""The levels at which a pixel's samples gather: in full light, and in the umbra.
+
+The most extreme of n noisy samples is off by about √(2 ln n) standard deviations. Here all samples
+near the extreme are averaged as they come, so that noise averages out however long the scan; with
+little noise the band is narrow and the level goes to the plain extreme.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation.order import Ranked
+from daemon.separation.radiometry import Plane
+
+BAND = 2.5
+"""Samples so many standard deviations short of the second most extreme one are averaged."""
+
+RESTART = 0.25
+"""Part of the band's width by which its edge may move before the mean begins again."""
+
+NEAR = 0.1
+"""Samples so far from the second most extreme one, of the way to the other end, count as being
+there; or within the band, if that is wider."""
+
+Part = tuple[slice, slice]
+WHOLE: Part = (slice(None), slice(None))
+
+_KEPT = 2
+_CHUNK = 1 << 15  # samples that are worked on at a time, so that they stay in the cache
+
+
+class Plateaus:
+    """Both ends of each pixel's samples: the levels, and how many samples were there.
+
+    Each band's edge follows the second most extreme sample; the mean begins again when the edge has
+    moved on, so what came before the first full light is forgotten. Constant memory: for each end
+    two planes of the samples' type and five more. Samples are encoded counts.
+    """
+
+    def __init__(self) -> None:
+        self.high = _End(largest=True)
+        self.low = _End(largest=False)
+
+    @property
+    def frames(self) -> int:
+        """Frames taken in."""
+        return self.high.ranked.frames
+
+    def add(self, samples: NDArray[Any], deviation: Plane | None) -> None:
+        """Take in a frame; `deviation` of one sample is float32, by count (a table); None: 0."""
+        ends = (self.high, self.low)
+        for end in ends:
+            end.ranked.add(samples)
+        if self.frames == 1:
+            for end in ends:
+                end.begin(samples)
+            return
+        for part in _chunks(samples.shape):
+            span = self.high.edge(part) - self.low.edge(part)
+            for end in ends:
+                end.follow(samples[part], part, span, deviation)
+
+
+class _End:
+    """One end of the samples' range."""
+
+    def __init__(self, *, largest: bool) -> None:
+        self.ranked = Ranked(_KEPT, largest=largest)
+        self._sign = np.float32(1 if largest else -1)
+
+    @property
+    def extreme(self) -> NDArray[Any]:
+        """The most extreme sample. Raises ValueError with no frames."""
+        first: NDArray[Any] = self.ranked.planes[0]
+        return first
+
+    def edge(self, part: Any) -> Plane:
+        """The second most extreme sample of a part of the picture, float32."""
+        second: Plane = self.ranked.planes[1][part].astype(np.float32)
+        return second
+
+    def begin(self, samples: NDArray[Any]) -> None:
+        """Take the first frame for what there is."""
+        self._sum = samples.astype(np.float32)
+        self._base = self._sum.copy()  # the edge when the mean began
+        self._near_base = self._sum.copy()  # ... and when counting began
+        self._count = np.ones(samples.shape, np.uint16)
+        self._near = np.ones(samples.shape, np.uint16)
+
+    def follow(
+        self, samples: NDArray[Any], part: Any, span: Plane, deviation: Plane | None
+    ) -> None:
+        """Take in a part of a frame that `ranked` has taken in."""
+        first, second = (plane[part] for plane in self.ranked.planes)
+        edge = second.astype(np.float32)
+        width = np.float32(0.5)
+        if deviation is not None:
+            width = np.take(deviation, second)
+            width *= np.float32(BAND)
+        reach = np.maximum(np.float32(NEAR) * span, width)
+        beyond = (samples.astype(np.float32) - edge) * self._sign
+        full = np.uint16(65535)
+
+        count, near = self._count[part], self._near[part]
+        within = beyond >= -width
+        np.add(self._sum[part], samples, out=self._sum[part], where=within)
+        np.add(count, 1, out=count, where=within & (count < full), casting="unsafe")
+        np.add(near, 1, out=near, where=(beyond >= -reach) & (near < full), casting="unsafe")
+
+        # The edge goes outwards, but for the second frame: the first one was its own second.
+        moved = np.abs(edge - self._base[part]) > np.float32(RESTART) * width
+        alone = (first - edge) * self._sign > width
+        np.copyto(self._base[part], edge, where=moved)
+        np.copyto(self._sum[part], np.where(alone, edge, edge + first), where=moved)
+        np.copyto(count, np.where(alone, np.uint16(1), np.uint16(2)), where=moved)
+        afar = np.abs(edge - self._near_base[part]) > reach
+        alone = (first - edge) * self._sign > reach
+        np.copyto(self._near_base[part], edge, where=afar)
+        np.copyto(near, np.where(alone, np.uint16(1), np.uint16(2)), where=afar)
+
+    def level(
+        self, deviation: Plane | None, span: Plane, part: Part = WHOLE
+    ) -> tuple[Plane, NDArray[np.uint16], NDArray[np.uint16]]:
+        """The level (float32 counts), how many samples it rests on, and how many were near it.
+
+        A sample beyond the level by a tenth of `span` (float32, counts) and more than noise stands
+        alone: it is taken for the level, which then rests on 1. Raises ValueError with no frames.
+        """
+        extreme, count = self.extreme[part], self._count[part]
+        mean = np.divide(self._sum[part], count, dtype=np.float32)
+        width = np.float32(0.5) if deviation is None else np.take(deviation, extreme) * BAND
+        beyond = (extreme.astype(np.float32) - mean) * self._sign
+        alone = beyond > np.maximum(np.float32(NEAR) * span, np.float32(2.0) * width)
+        level = np.where(alone, extreme, mean).astype(np.float32)
+        one = np.uint16(1)
+        near = np.maximum(self._near[part], count)
+        return level, np.where(alone, one, count), np.where(alone, one, near)
+
+
+def _chunks(shape: tuple[int, ...]) -> Iterator[slice]:
+    rows = max(1, _CHUNK * shape[0] // max(int(np.prod(shape)), 1))
+    return (slice(start, start + rows) for start in range(0, shape[0], rows))

@@ -1,0 +1,224 @@
+"""A simulated wall behind a moving mesh: components, what noise does, and what was not covered."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.mesh import MeshOccluder
+from daemon.separation.radiometry import Response
+from protocol.mesh import Mesh
+
+HEIGHT, WIDTH = 96, 128
+PITCH = 16.0  # pixels
+MESH = Mesh(0.625 * PITCH, PITCH)
+DEEP = Response(full_scale=65535)
+AMBIENT = 3000.0
+CAST = np.s_[20:52, 80:120]  # the scene's own shadow, larger than a pitch
+COVERING, SHORT = 0.95, 0.55  # radii in pitches: every point lit and shaded; islands never lit
+
+
+def scene() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Direct and global light of a textured wall."""
+    rng = np.random.default_rng(3)
+    albedo = 1.0 + 0.1 * rng.standard_normal((HEIGHT, WIDTH))
+    albedo[60:80, 20:50] *= 0.5
+    direct, indirect = 24000.0 * albedo, 9000.0 * albedo
+    direct[CAST] = 0.0
+    return direct, indirect
+
+
+def circle(
+    radius: float, frames: int = 72, noise: float = 0.0, ambient: float = 0.0
+) -> list[NDArray[Any]]:
+    """Frames of the wall while the mesh goes round once."""
+    rng = np.random.default_rng(4)
+    direct, indirect = scene()
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
+    found = []
+    for k in range(frames):
+        angle = math.tau * k / frames
+        clear = MESH.clearance(
+            x + radius * PITCH * math.cos(angle), y + radius * PITCH * math.sin(angle)
+        )
+        through = np.clip(clear + 0.5, 0, 1)
+        light = through * direct + MESH.hole_fraction * indirect + ambient
+        found.append(counts(light + rng.normal(0, noise, light.shape)))
+    return found
+
+
+def counts(light: NDArray[np.float64]) -> NDArray[np.uint16]:
+    return np.rint(np.clip(light, 0, 65535)).astype(np.uint16)
+
+
+def separate(
+    frames: Sequence[NDArray[Any]],
+    beta: float | None = MESH.hole_fraction,
+    references: dict[Lighting, NDArray[np.float64]] | None = None,
+    *,
+    averaged: bool = True,
+    response: Response = DEEP,
+) -> Components:
+    estimator = MeshOccluder(response, hole_fraction=beta, averaged=averaged)
+    for kind, light in (references or {}).items():
+        estimator.update(counts(light), Observation(lighting=kind))
+    for frame in frames:
+        estimator.update(frame, Observation())
+    return estimator.result()
+
+
+def errors(found: Components) -> tuple[float, float]:
+    direct, indirect = scene()
+    return (
+        float(np.sqrt(np.nanmean((found.direct - direct) ** 2))),
+        float(np.sqrt(np.nanmean((found.global_ - indirect) ** 2))),
+    )
+
+
+def flagged(found: Components, flag: Quality) -> NDArray[np.bool_]:
+    return np.asarray((found.quality & np.uint16(flag)) != 0)
+
+
+def test_without_noise_both_estimators_are_exact() -> None:
+    frames = circle(COVERING)
+    for averaged in (True, False):
+        found = separate(frames, averaged=averaged)
+        assert np.isnan(found.direct).mean() < 0.01
+        assert max(errors(found)) < 60.0  # 0.1 % of full scale
+        assert found.facts["coverage"] > 0.985
+
+
+def test_averaging_halves_what_noise_does_to_extremes() -> None:
+    frames = circle(COVERING, noise=650.0)
+    averaged, extremes = (errors(separate(frames, averaged=a)) for a in (True, False))
+    assert averaged[0] < 0.5 * extremes[0]
+    assert averaged[1] < 0.5 * extremes[1]
+
+
+@pytest.mark.parametrize("noise", [0.0, 300.0])
+def test_islands_that_were_never_lit_are_flagged_and_not_guessed(noise: float) -> None:
+    frames = circle(SHORT, noise=noise)
+    direct, _ = scene()
+    span = np.max(circle(SHORT), axis=0).astype(float) - np.min(circle(SHORT), axis=0)
+    lit_part = np.divide(span, direct, out=np.ones_like(direct), where=direct > 0)
+    missed, reached = lit_part < 0.6, lit_part > 0.97
+    assert 0.02 < missed.mean() < 0.3
+    found = separate(frames)
+    never = flagged(found, Quality.NEVER_LIT)
+    assert never[missed].mean() > 0.9
+    assert never[reached].mean() < 0.05
+    assert np.isnan(found.direct[never]).all()
+    assert np.isnan(found.global_[never]).all()
+    assert (found.planes["coverage"][never] == 0).all()
+    plain = separate(frames, averaged=False)
+    assert errors(found)[0] < 0.05 * 65535
+    assert flagged(plain, Quality.NEVER_LIT)[missed].mean() > 0.9
+    assert found.facts["pitch_px"] == pytest.approx(PITCH, rel=0.25)
+
+
+def test_the_scenes_own_shadow_is_measured_not_flagged() -> None:
+    found = separate(circle(COVERING, noise=200.0))
+    inside = np.s_[24:48, 84:116]
+    unknown = Quality.NEVER_LIT | Quality.NEVER_UNLIT
+    assert flagged(found, unknown)[inside].mean() < 0.02
+    assert flagged(found, Quality.LOW_MODULATION)[inside].mean() > 0.9
+    _, indirect = scene()
+    np.testing.assert_allclose(
+        np.nanmean(found.global_[inside]), indirect[inside].mean(), rtol=0.08
+    )
+
+
+def test_an_ambient_frame_is_removed() -> None:
+    ambient = np.full((HEIGHT, WIDTH), AMBIENT)
+    frames = circle(COVERING, ambient=AMBIENT)
+    wrong = errors(separate(frames))
+    assert wrong[1] > 0.9 * AMBIENT / MESH.hole_fraction
+    found = separate(frames, references={Lighting.AMBIENT: ambient})
+    assert max(errors(found)) < 60.0
+    assert found.facts["ambient_from"] == "ambient frame"
+
+
+def test_an_open_frame_tells_ambient_and_global_apart() -> None:
+    direct, indirect = scene()
+    frames = circle(COVERING, ambient=AMBIENT)
+    found = separate(frames, references={Lighting.OPEN: direct + indirect + AMBIENT})
+    assert max(errors(found)) < 60.0
+    assert found.facts["ambient_from"] == "open frame"
+
+
+def test_the_hole_fraction_is_measured_after_ambient_is_removed() -> None:
+    direct, indirect = scene()
+    references = {
+        Lighting.AMBIENT: np.full((HEIGHT, WIDTH), AMBIENT),
+        Lighting.OPEN: direct + indirect + AMBIENT,
+    }
+    found = separate(circle(COVERING, ambient=AMBIENT), None, references)
+    assert found.facts["hole_fraction"] == pytest.approx(MESH.hole_fraction, rel=0.06)
+    assert found.facts["hole_fraction_from"] == "frames"
+    with pytest.raises(NotYet, match="ambient and an open frame"):
+        separate(circle(COVERING), None)
+
+
+def test_a_still_mesh_covers_nothing() -> None:
+    found = separate([circle(COVERING)[0]] * 4)
+    assert found.facts["coverage"] == 0.0
+    assert np.isnan(found.direct).all()
+
+
+def test_one_flash_of_light_is_kept_and_flagged() -> None:
+    frames = circle(COVERING, noise=50.0)
+    dark = np.min(frames, axis=0)
+    spot = np.s_[30:36, 40:46]
+    for k, frame in enumerate(frames):
+        if k != 20:
+            frame[spot] = np.minimum(frame[spot], dark[spot] + 200)
+        else:
+            frame[spot] = dark[spot] + 24000
+    found = separate(frames)
+    assert flagged(found, Quality.SINGLE)[spot].mean() > 0.9
+    assert (found.planes["coverage"][spot] == 1).mean() > 0.9
+    assert flagged(found, Quality.SINGLE).mean() < 0.01
+
+
+def test_coverage_grows_to_its_end() -> None:
+    estimator = MeshOccluder(DEEP, hole_fraction=MESH.hole_fraction)
+    seen = []
+    for frame in circle(COVERING, noise=100.0):
+        estimator.update(frame, Observation())
+        seen.append(estimator.summary()["coverage"])
+    assert seen[0] == 0.0
+    assert seen[20] < 0.9
+    assert seen[-1] > 0.97
+
+
+def test_colour_mosaic_and_tone() -> None:
+    frames = circle(COVERING)
+    colour = separate([np.repeat(f[..., None], 3, axis=2) for f in frames])
+    assert colour.direct.shape == (HEIGHT, WIDTH, 3)
+    raw = separate(frames, response=Response(full_scale=65535, bayer="RG"))
+    assert raw.direct.shape == (HEIGHT, WIDTH, 3)
+    gamma = Response(full_scale=65535, tone="gamma:2.2")
+    encoded = [np.rint(65535 * (f / 65535.0) ** (1 / 2.2)).astype(np.uint16) for f in frames]
+    assert max(errors(separate(encoded, response=gamma))) < 400.0
+
+
+def test_the_same_observations_give_the_same_bits() -> None:
+    frames = circle(COVERING, noise=300.0)
+    one, other = (MeshOccluder(DEEP, hole_fraction=0.3) for _ in range(2))
+    for k, frame in enumerate(frames):
+        one.update(frame, Observation())
+        one.summary()
+        if k % 10 == 5:
+            one.result()
+    for frame in frames:
+        other.update(frame.copy(), Observation())
+    a, b = one.result(), other.result()
+    assert a.direct.tobytes() == b.direct.tobytes()
+    assert a.global_.tobytes() == b.global_.tobytes()
+    assert a.quality.tobytes() == b.quality.tobytes()
