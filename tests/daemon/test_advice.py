@@ -64,9 +64,9 @@ def seen(step: Expose, blur: float, scatter_px: float, level: float) -> NDArray[
     image = patterns.render(step.pattern, 192, 144).astype(np.float32) / 255
     sent = cv2.GaussianBlur(image, (0, 0), blur, borderType=cv2.BORDER_REPLICATE)
     indirect = np.full(image.shape, image.mean(), dtype=np.float32)
-    if scatter_px:  # in the right half light scatters below the surface
+    if scatter_px:  # in the right third light scatters below the surface
         local = cv2.GaussianBlur(image, (0, 0), scatter_px, borderType=cv2.BORDER_REPLICATE)
-        indirect[:, 96:] = np.asarray(local)[:, 96:]
+        indirect[:, 128:] = np.asarray(local)[:, 128:]
     return np.asarray(level * (0.5 * sent + 0.5 * indirect))
 
 
