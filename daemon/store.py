@@ -86,6 +86,7 @@ class RunFolder:
     def __init__(self, path: Path, file: RunFile) -> None:
         self.path = path
         self.file = file
+        self.unwritten = False  # something is only remembered here
         self._lock = threading.Lock()
 
     @classmethod
@@ -112,6 +113,18 @@ class RunFolder:
         """
         with self._lock:
             return self._replace(changes)
+
+    def remember(self, **changes: Any) -> None:
+        """Change fields here only, when the disk refuses them; `flush` writes them later."""
+        with self._lock:
+            self.file = msgspec.structs.replace(self.file, **changes)
+            self.unwritten = True
+
+    def flush(self) -> None:
+        """Write what was only remembered. Raises StorageError."""
+        if self.unwritten:
+            self.update()
+            self.unwritten = False
 
     def add_products(self, products: Iterable[Product]) -> RunFile:
         """Add to the list of products; one of the same name takes its place. As `update`."""
@@ -294,6 +307,23 @@ class Store:
                     total -= sizes[run.id]
                     gone.append(run.id)
             return gone
+
+    # ------------------------------------------------------------ marks
+
+    def mark(self, name: str) -> None:
+        """Remember durably that something is so, until `unmark`. Raises StorageError."""
+        with storage(f"marking {name}"):
+            atomic_write(self.data / name, b"")
+
+    def unmark(self, name: str) -> None:
+        """It is so no longer; idempotent. Raises StorageError."""
+        with storage(f"unmarking {name}"):
+            (self.data / name).unlink(missing_ok=True)
+            fsync_folder(self.data)
+
+    def marked(self, name: str) -> bool:
+        """Whether it was marked, also before a restart."""
+        return (self.data / name).exists()
 
     # ------------------------------------------------------------ room
 
