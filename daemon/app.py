@@ -118,8 +118,9 @@ class _Daemon:
                 loop.call_soon_threadsafe(publisher.publish, body)
 
             def glimpsed(glimpse: Glimpse) -> None:
-                body = PreviewTaken(run=glimpse.run, what="frame", facts=glimpse.facts)
-                loop.call_soon_threadsafe(lambda: publisher.publish(body, preview=glimpse.picture))
+                body = PreviewTaken(run=glimpse.run, what=glimpse.what, facts=glimpse.facts)
+                arrays = {"preview": glimpse.picture, "saturated": glimpse.saturated}
+                loop.call_soon_threadsafe(lambda: publisher.publish(body, **arrays))
 
             def changed() -> None:
                 loop.call_soon_threadsafe(commands.changed)

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from daemon import __version__, discovery, measured, picture, products
+from daemon.calibration import Calibrations
 from daemon.config import RigConfig
 from daemon.doctor.examination import Doctor
 from daemon.logs import LogBook
@@ -22,7 +23,7 @@ from daemon.scans import catalog
 from daemon.separation.estimator import Components, Result
 from daemon.server import Answer, Caller
 from daemon.store import RunFolder, Store
-from daemon.viewfinder import Viewfinder, facts_of
+from daemon.viewfinder import Glimpse, Viewfinder, cells, facts_of
 from drivers.base import CameraSettings as DriverSettings
 from drivers.base import PixelFormat
 from protocol import messages as m
@@ -81,6 +82,8 @@ class Commands:
             m.GetProduct: self._product,
             m.GetLog: self._log,
             m.GetPreview: self._preview,
+            m.StartLive: self._start_live,
+            m.StopLive: self._stop_live,
             m.Show: self._show,
             m.Snap: self._snap,
             m.SetCamera: self._camera,
@@ -294,10 +297,9 @@ class Commands:
                     raise UmbraError(
                         Code.NO_RESULT, "no frame has been taken yet; `umbra snap` takes one"
                     )
-                small = picture.narrowed(glimpse.picture, command.width)
-                return Answer(
-                    m.Picture(facts={**glimpse.facts, "run": glimpse.run}), {"preview": small}
-                )
+                return _looked(glimpse, command.width)
+            if self._manual.live.separating and (seen := self._viewfinder.latest(command.what)):
+                return _looked(seen, command.width)
             run = self._runner.find("")
             components, _ = self._result_of(run)
             if not isinstance(components, Components):
@@ -332,6 +334,33 @@ class Commands:
                 Code.BUSY,
                 f"{current.id} is using the devices; wait for it, or `umbra abort`",
             )
+
+    async def _start_live(self, command: m.StartLive, asked: _Asked) -> Answer:
+        def look() -> None:
+            bench = None
+            if command.separate is not None:
+                bench = self._rig.bench(self._calibration())
+            self._manual.look(command.rate_hz, command.lease_s, command.separate, bench)
+
+        await self._by_hand(asked, look)
+        return Answer(m.Done(message=f"live for {command.lease_s:g} s, unless asked again"))
+
+    def _calibration(self) -> dict[str, Any]:
+        """The values that apply to the rig as it is now."""
+        camera = self._rig.camera.device
+        in_force = camera.settings()
+        settings = {
+            "exposure_us": in_force.exposure_us,
+            "gain": in_force.gain,
+            "pixel_format": camera.info().pixel_format.value,
+        }
+        found = Calibrations(self._store, self._config.calibration.max_age_days)
+        values: dict[str, Any] = found.of(self._rig.snapshot(), settings)["values"]
+        return values
+
+    async def _stop_live(self, _: m.StopLive, __: _Asked) -> Answer:
+        await asyncio.to_thread(self._manual.live.stop)
+        return Answer(m.Done(message="the live view has ended"))
 
     async def _show(self, command: m.Show, asked: _Asked) -> Answer:
         await self._by_hand(asked, lambda: self._manual.show(command.pattern, command.lease_s))
@@ -428,6 +457,12 @@ class _Asked:
         self.caller = caller
         self.request_id = request_id
         self.token = token
+
+
+def _looked(glimpse: Glimpse, width: int) -> Answer:
+    small = picture.narrowed(glimpse.picture, width)
+    arrays = {"preview": small, "saturated": cells(glimpse.saturated, *small.shape[:2])}
+    return Answer(m.Picture(facts={**glimpse.facts, "run": glimpse.run}), arrays)
 
 
 def _about(run: RunFolder) -> Answer:
