@@ -95,8 +95,8 @@ class DisplayProjector(Projector):
     """See the module. `show` also takes (H, W, 3) RGB, for drivers that send bit planes.
 
     The moment that `show` gives is the flip's plus `latency_frames` refreshes: measure those
-    (`umbra calibrate latency`), the default is what slow projectors need. In the safe state it
-    shows black; the lamp stays on.
+    (docs/projectors.md), the default is what slow projectors need. The safe state is black, the
+    lamp stays on; `safe` returns when it is black by the same reckoning.
     """
 
     options_type = DisplayOptions
@@ -109,6 +109,7 @@ class DisplayProjector(Projector):
         self._size = (0, 0)
         self._refresh_hz = 0.0
         self._facts: dict[str, Any] = {}
+        self._halted = threading.Event()
         self._next = 0  # windowed: when the next refresh would be
 
     # ------------------------------------------------------------ life
@@ -247,11 +248,13 @@ class DisplayProjector(Projector):
             )
 
     def safe(self) -> None:
-        """See Device: black."""
-        self.show(np.zeros(self._size[::-1], np.uint8))
+        """See Device: black. A halt ends the wait for the light, not the flip."""
+        self._halted.clear()
+        self.clock.wait_until(self.show(np.zeros(self._size[::-1], np.uint8)), self._halted)
 
     def halt(self) -> None:
-        """See Device. No call blocks for longer than a refresh."""
+        """See Device. No flip blocks for longer than a refresh."""
+        self._halted.set()
 
     def close(self) -> None:
         """See Device."""

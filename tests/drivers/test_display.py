@@ -135,6 +135,25 @@ def test_flips_tell_when_light_comes(make: Callable[..., Thread]) -> None:
     assert all(b > a for a, b in pairwise(moments))
 
 
+def test_safe_is_over_when_the_light_is_black(make: Callable[..., Thread]) -> None:
+    thread = make(latency_frames=3)
+    thread.call(lambda d: d.connect(), 20)
+    lit = thread.call(lambda d: d.show(noise(HEIGHT, WIDTH)), 10)
+    thread.call(lambda d: d.safe(), 10)
+    assert thread.device.clock.now_ns() > lit
+
+
+def test_halt_ends_the_wait_for_black(make: Callable[..., Thread], screen: str) -> None:
+    thread = make(latency_frames=100_000)
+    thread.call(lambda d: d.connect(), 20)
+    thread.call(lambda d: d.show(noise(HEIGHT, WIDTH)), 10)
+    safe = thread.submit(lambda d: d.safe(), 60)
+    while not safe.done():  # a halt that comes before the call is not remembered
+        thread.device.halt()
+    safe.result()
+    assert not screenshot(screen).any()
+
+
 def test_a_window_to_try_things_in(make: Callable[..., Thread], screen: str) -> None:
     thread = make(windowed=True, size=[200, 100], refresh_hz=100)
     thread.call(lambda d: d.connect(), 20)
