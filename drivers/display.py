@@ -203,7 +203,7 @@ class DisplayProjector(Projector):
             moments.append(self.clock.now_ns())
         rate = NS / max(1.0, float(np.median(np.diff(moments))))
         told = self._o.refresh_hz
-        if rate > FASTEST_HZ:
+        if rate > FASTEST_HZ or not pygame.display.is_vsync():
             raise self._refuse(
                 "connect",
                 f"flips do not wait for the refresh ({rate:.0f} a second)",

@@ -83,6 +83,18 @@ def test_every_pixel_is_on_the_screen_as_it_was_asked_for(
     assert not screenshot(screen).any()
 
 
+def test_nothing_else_is_seen_and_flips_wait(make: Callable[..., Thread]) -> None:
+    """A screenshot has no cursor in it: what SDL was told has to do."""
+    thread = make()
+    thread.call(lambda d: d.connect(), 20)
+    asked = ("mouse.get_visible", "display.get_allow_screensaver", "display.is_vsync")
+
+    def told(_: display.DisplayProjector) -> list[bool]:
+        return [getattr(getattr(pygame, a), b)() for a, b in (name.split(".") for name in asked)]
+
+    assert thread.call(told, 10) == [False, False, True]
+
+
 def test_it_stays_for_as_long_as_nothing_else_is_shown(
     make: Callable[..., Thread], screen: str
 ) -> None:
