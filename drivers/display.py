@@ -140,12 +140,6 @@ class DisplayProjector(Projector):
     def _open(self) -> Identity:
         _start(self._o.video_driver)
         driver = pygame.display.get_driver()
-        if driver in {"dummy", "offscreen"}:
-            raise self._refuse(
-                "connect",
-                f"SDL found no display: its {driver} driver shows nothing",
-                NO_DISPLAY,
-            )
         index = self._find(_names(driver))
         output = pygame.display.get_desktop_sizes()[index]
         size = self._o.size or output
@@ -339,12 +333,21 @@ class DisplayProjector(Projector):
 
 
 def _start(video_driver: str) -> None:
-    """Start SDL's video in this thread. Raises pygame.error."""
+    """Start SDL's video in this thread. Raises pygame.error, also where nothing can be seen."""
     for key, value in HINTS.items():
         os.environ.setdefault(key, value)
     if video_driver:
+        before = os.environ.get("SDL_VIDEODRIVER")
         os.environ["SDL_VIDEODRIVER"] = video_driver
-    pygame.display.init()
+    try:
+        pygame.display.init()
+    finally:
+        if video_driver:
+            del os.environ["SDL_VIDEODRIVER"]
+            if before is not None:
+                os.environ["SDL_VIDEODRIVER"] = before
+    if (driver := pygame.display.get_driver()) in {"dummy", "offscreen"}:
+        raise pygame.error(f"no display was found (its {driver} driver shows nothing)")
 
 
 def _names(driver: str) -> list[str]:

@@ -186,7 +186,7 @@ def test_a_window_to_try_things_in(make: Callable[..., Thread], screen: str) -> 
         ({"output": "HDMI-9"}, DeviceLost, "no output 'HDMI-9'"),
         ({"size": [912, 1140]}, DeviceRefused, "is 640 x 480, not 912 x 1140; set the output's"),
         ({"refresh_hz": 400.0}, DeviceRefused, "not at refresh_hz = 400"),
-        ({"video_driver": "dummy"}, DeviceRefused, "dummy driver shows nothing"),
+        ({"video_driver": "dummy"}, DeviceLost, r"no display was found \(its dummy driver"),
         ({"video_driver": "vga"}, DeviceLost, "projector: connect: SDL: .*vga.*DISPLAY"),
     ],
 )
@@ -218,8 +218,9 @@ def test_without_any_display_the_remedy_is_named(
     make: Callable[..., Thread], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("DISPLAY")
-    with pytest.raises((DeviceLost, DeviceRefused), match=r"projector: connect: SDL.*; "):
+    with pytest.raises(DeviceLost, match=r"projector: connect: SDL: .*; set DISPLAY for a desk"):
         make().call(lambda d: d.connect(), 20)
+    assert display.DisplayProjector.discover() == []
 
 
 def test_one_display_a_process(make: Callable[..., Thread]) -> None:
