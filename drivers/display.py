@@ -16,6 +16,7 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -154,9 +155,11 @@ class DisplayProjector(Projector):
                     "set the output's mode: nothing is ever scaled",
                 )
             flags = pygame.FULLSCREEN | pygame.SCALED  # SCALED, at the output's size, is for vsync
-        surface = pygame.display.set_mode(
-            size, flags, display=index, vsync=0 if self._o.windowed else 1
-        )
+        with warnings.catch_warnings(record=True) as slow:  # "no fast renderer": without a GPU
+            warnings.simplefilter("always")
+            surface = pygame.display.set_mode(
+                size, flags, display=index, vsync=0 if self._o.windowed else 1
+            )
         pygame.mouse.set_visible(False)
         pygame.display.set_allow_screensaver(False)
         self._surface, self._size = surface, size
@@ -168,6 +171,7 @@ class DisplayProjector(Projector):
             "sdl": ".".join(map(str, pygame.get_sdl_version())),
             "video_driver": driver,
             "refresh_hz": round(self._refresh_hz, 3),
+            "flips_by": "timer" if slow or self._o.windowed else "output",
             "channel": self._o.channel,
         }
         return Identity(f"display {name} {size[0]}x{size[1]}", "", f"SDL {self._facts['sdl']}")

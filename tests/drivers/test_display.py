@@ -95,6 +95,15 @@ def test_nothing_else_is_seen_and_flips_wait(make: Callable[..., Thread]) -> Non
     assert thread.call(told, 10) == [False, False, True]
 
 
+def test_without_a_gpu_it_says_that_a_timer_paces_flips(
+    make: Callable[..., Thread], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SDL_RENDER_DRIVER", "software")
+    thread = make()
+    thread.call(lambda d: d.connect(), 20)
+    assert thread.device.facts()["flips_by"] == "timer"
+
+
 def test_it_stays_for_as_long_as_nothing_else_is_shown(
     make: Callable[..., Thread], screen: str
 ) -> None:
