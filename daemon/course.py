@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -36,7 +37,7 @@ from drivers.base import CameraInfo, CameraSettings, DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
 from protocol.messages import End, Progress, RunState
-from protocol.scans import Spec
+from protocol.scans import OccluderScan, Spec
 
 _PROGRESS_S = 0.1
 _ROOM_S = 1.0
@@ -83,6 +84,7 @@ class Course:
         self._room_seen = 0.0
         self._timings: dict[str, float] = {}
         self._exposure_s = 0.0
+        self._reason = ""  # why the steps ended
         self.beat = time.monotonic()
 
     # ------------------------------------------------------------ for others
@@ -218,7 +220,7 @@ class Course:
         start: tuple[int, int],
     ) -> None:
         try:
-            Sequencer(
+            sequencer = Sequencer(
                 rig=self._rig,
                 session=session,
                 control=self.control,
@@ -228,7 +230,9 @@ class Course:
                 patience=self._config.sequencer,
                 may_go_on=self._may_go_on,
                 on_pause=self._paused,
-            ).run(*start, taken=recorder.tally.taken)
+            )
+            sequencer.run(*start, taken=recorder.tally.taken)
+            self._reason = sequencer.reason
         except Behind as error:
             raise UmbraError(
                 Code.STORAGE_FAILED,
@@ -245,6 +249,8 @@ class Course:
         wanted = CameraSettings(exposure_us=spec.exposure_us, gain=spec.gain)
         if before is not None and (known := before.get("settings")):
             wanted = CameraSettings(exposure_us=known["exposure_us"], gain=known["gain"])
+        if isinstance(spec, OccluderScan) and spec.frame_rate_hz is not None:
+            wanted = replace(wanted, frame_rate_hz=spec.frame_rate_hz)
         camera = self._rig.camera
         in_force = camera.call(lambda c: c.configure(wanted), CALL_S, session)
         self._exposure_s = (in_force.exposure_us or 0.0) * 1e-6
@@ -374,7 +380,7 @@ class Course:
                 f"({', '.join(str(n) for n in lost[:8])}{' ...' if len(lost) > 8 else ''}); "
                 "the products are made without them",
             )
-        return End(state=RunState.DONE, reason="all steps were exposed")
+        return End(state=RunState.DONE, reason=self._reason)
 
     def _close(self, end: End) -> None:
         try:

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from daemon.config import SequencerSection
 from daemon.control import Control
 from daemon.devicethread import Session, Stuck
+from daemon.motion import Mover
 from daemon.patterns import predistorted, render
 from daemon.proof import Proof
 from daemon.recorder import Exposed, Recorder
@@ -119,7 +120,8 @@ class Sequencer:
         self._lit: Expose | None = None
         self._lit_ns = 0
         self._lit_image: NDArray[np.uint8] | None = None
-        self._looks = Proof()
+        self._looks = Proof() if method.looked_at else None
+        self.reason = "all steps were exposed"
 
     def run(self, step_index: int, sub: int, taken: int) -> None:
         """All steps from `step_index`/`sub` on; `taken` frames were had before.
@@ -213,7 +215,8 @@ class Sequencer:
             self._lit_image = None
         else:
             image = self._lit_image = self._image(step)
-            flipped = self._projector.call(lambda p: p.show(image), SHOW_S, self._session)
+            sent = image if self._tone is None else predistorted(image, self._tone)
+            flipped = self._projector.call(lambda p: p.show(sent), SHOW_S, self._session)
             self._lit_ns = flipped + self._latency_ns
 
     def _image(self, step: Expose) -> NDArray[np.uint8]:
@@ -221,10 +224,7 @@ class Sequencer:
         assert step.pattern is not None
         if self._drawn is None or self._drawn[0] != step.pattern:
             info = self._projector.device.info()
-            image = render(step.pattern, info.width, info.height)
-            if self._tone is not None:
-                image = predistorted(image, self._tone)
-            self._drawn = (step.pattern, image)
+            self._drawn = (step.pattern, render(step.pattern, info.width, info.height))
         return self._drawn[1]
 
     def _draw_ahead(self, index: int) -> None:
@@ -283,7 +283,7 @@ class Sequencer:
                     exposure.sub,
                     frame,
                     exposure.buffer,
-                    exposure.lit_ns,
+                    lit_ns=exposure.lit_ns,
                 )
                 return
             self._ring.give(exposure.buffer)
@@ -323,46 +323,95 @@ class Sequencer:
         if exposure.dark_ns and frame.end_ns > exposure.dark_ns:
             late = (frame.end_ns - exposure.dark_ns) / NS * 1e3
             return f"the exposure ended {late:.2f} ms after its pattern was taken down"
+        if self._looks is None:
+            return ""
         return self._looks.problem(frame.pixels, exposure.step, exposure.image)
 
     # ------------------------------------------------------------ video steps
 
     def _watch(self, index: int, step: Watch, first: int) -> None:
+        """A video: frames as they come, while the stage moves, until there is enough."""
+        self._settle()
+        mover = self._set_going(step)
+        began = self._clock.now_ns()
+        sub, last = first, None
+        try:
+            while step.frames is None or sub < step.frames:
+                self._may_go_on()
+                if mover is not None and self._control.paused:
+                    mover.end()
+                if self._control.checkpoint(self._session, self._paused):
+                    mover, last = self._set_going(step), None
+                seconds = (self._clock.now_ns() - began) / NS
+                if reason := self._enough(mover, seconds):
+                    self.reason = reason
+                    return
+                came = self._next_frame(index, step, sub, last, mover)
+                if came is None:
+                    return
+                sub, last = came
+        finally:
+            if mover is not None:
+                mover.end()
+
+    def _set_going(self, step: Watch) -> Mover | None:
+        """Lights on, the stage going, the camera streaming."""
+        for name in step.lights:
+            self._rig.lights[name].call(lambda x: x.set(True), CALL_S, self._session)
+        mover = None
+        if step.motion is not None and self._rig.stage is not None:
+            mover = Mover(
+                self._rig.stage,
+                step.motion,
+                self._session,
+                beat=self._may_go_on,
+                wake=self._camera.device.halt,
+            )
+            mover.begin()
         self._acquire(Acquisition.FREE)
-        sub = first
-        last: int | None = None
-        while step.frames is None or sub < step.frames:
-            self._may_go_on()
-            if self._control.checkpoint(self._session, self._paused):
-                self._acquire(Acquisition.FREE)
-                last = None
-            buffer = self._ring.take(_RING_S if self._info.recorded else 0.0)
-            behind = buffer is None
-            if buffer is None:
-                if self._info.recorded:
-                    raise Behind
-                buffer = np.empty(self._info.shape, self._info.pixel_format.dtype)
-            try:
-                frame = self._grab_free(buffer)
-            except EndOfRecording:
+        return mover
+
+    def _enough(self, mover: Mover | None, seconds: float) -> str:
+        """Why the video ends now; "": it goes on. Raises what went wrong with the stage."""
+        if mover is not None:
+            mover.check()
+            if mover.over:
+                return "the stage's motion has come to its end"
+        return self._method.enough(self._summary(), seconds)
+
+    def _next_frame(
+        self, index: int, step: Watch, sub: int, last: int | None, mover: Mover | None
+    ) -> tuple[int, int | None] | None:
+        """Take a frame or record why there is none; the next sub-index and the last sequence
+        number, or None at the end of a recording."""
+        buffer = self._ring.take(_RING_S if self._info.recorded else 0.0)
+        behind = buffer is None
+        if buffer is None:
+            if self._info.recorded:
+                raise Behind
+            buffer = np.empty(self._info.shape, self._info.pixel_format.dtype)
+        try:
+            frame = self._grab_free(buffer)
+        except EndOfRecording:
+            self._ring.give(buffer)
+            return None
+        if frame is None:
+            if not behind:
                 self._ring.give(buffer)
-                return
-            if frame is None:
-                if not behind:
-                    self._ring.give(buffer)
-                self._miss(index, step, sub, "no frame came in time")
-                sub += 1
-                continue
-            lost = 0 if last is None else max(0, frame.sequence - last - 1)
-            for _ in range(lost):
-                self._miss(index, step, sub, "lost between camera and host")
-                sub += 1
-            last = frame.sequence
-            if behind:
-                self._miss(index, step, sub, "the recorder did not keep up")
-            else:
-                self._put(index, step, sub, frame, buffer)
+            if mover is not None:
+                mover.check()
+            self._miss(index, step, sub, "no frame came in time")
+            return sub + 1, last
+        lost = 0 if last is None else max(0, frame.sequence - last - 1)
+        for _ in range(lost):
+            self._miss(index, step, sub, "lost between camera and host")
             sub += 1
+        if behind:
+            self._miss(index, step, sub, "the recorder did not keep up")
+        else:
+            at = mover.position_at(frame.mid_ns) if mover is not None else None
+            self._put(index, step, sub, frame, buffer, stage_mm=at)
+        return sub + 1, frame.sequence
 
     def _grab_free(self, buffer: Buffer) -> Frame | None:
         """The next frame of a stream; None if none came in time."""
@@ -392,11 +441,27 @@ class Sequencer:
         self._acquisition = wanted
 
     def _put(
-        self, index: int, step: Step, sub: int, frame: Frame, buffer: Buffer, lit_ns: int = 0
+        self,
+        index: int,
+        step: Step,
+        sub: int,
+        frame: Frame,
+        buffer: Buffer,
+        *,
+        lit_ns: int = 0,
+        stage_mm: tuple[float, float] | None = None,
     ) -> None:
         self._taken += 1
         self._recorder.put(
-            Exposed(step=step, index=index, sub=sub, frame=frame, buffer=buffer, lit_ns=lit_ns)
+            Exposed(
+                step=step,
+                index=index,
+                sub=sub,
+                frame=frame,
+                buffer=buffer,
+                stage_mm=stage_mm,
+                lit_ns=lit_ns,
+            )
         )
 
     def _miss(self, index: int, step: Step, sub: int, reason: str) -> None:

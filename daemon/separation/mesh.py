@@ -255,12 +255,14 @@ class MeshOccluder:
         assert self._last is not None
         rows = np.s_[:: _SAMPLE * 2]
         spacings = []
+        noise = self._sensor()
+        least = 1.0 if noise is None else 4 * SIGNIFICANT * noise.typical
         ends = self._plateaus.high.extreme, self._plateaus.low.extreme
         pictures = [_green(x) for x in (self._last, *ends)]
         for turned in (pictures, [x.T for x in pictures]):
             now, high, low = (x[rows].astype(np.float32) for x in turned)
-            tells = high - low > np.maximum(LEAST_MODULATION * 4 * high, 1.0)
-            lit = cv2.medianBlur((now > (high + low) / 2).astype(np.uint8), 3)
+            tells = high - low > np.maximum(4 * LEAST_MODULATION * high, least)
+            lit = now > (high + low) / 2
             edges = (lit[:, 1:] != lit[:, :-1]) & tells[:, 1:] & tells[:, :-1]
             if edges.any():
                 spacings.append(2.0 * np.count_nonzero(tells) / np.count_nonzero(edges))

@@ -94,9 +94,9 @@ class Scene:
                 estimator.update(self.frame(step, rng), observation)
             index += 1
         assert index
-        components = estimator.result()
-        assert isinstance(components, Components)
-        return method.conclude(components)
+        result = estimator.result()
+        assert isinstance(result, Components)
+        return method.conclude(result)
 
 
 DARK = Expose(BLACK)
