@@ -296,7 +296,7 @@ def _settings(subject: Subject) -> Iterable[tuple[str, Any]]:
 def asked(file: RunFile) -> Iterable[tuple[str, Any]]:
     """What a run was told."""
     for key, value in msgspec.to_builtins(file.spec).items():
-        if key not in {"method", "note"} and value is not None:
+        if key not in {"method", "note", "points"} and value is not None:
             yield key, value
     yield from file.rig.get("settings", {}).items()
 

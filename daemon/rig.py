@@ -87,6 +87,7 @@ class Rig:
         self._lock = threading.Lock()
         self._members: dict[str, _Member] = {}
         self._session: Session | None = None
+        self._latched = False  # an emergency stop is in force
         for table in config.devices:
             device = registry.build(table.kind, table.driver, table.name, table.options, context)
             self._members[table.name] = _Member(DeviceThread(device), table.driver)
@@ -259,8 +260,12 @@ class Rig:
     # ------------------------------------------------------------ use and safety
 
     def take(self, owner: str) -> Session:
-        """Begin a session: the one user of the devices. Raises UmbraError(busy)."""
+        """Begin a session: the one user of the devices. Raises UmbraError(busy, estopped)."""
         with self._lock:
+            if self._latched:
+                raise UmbraError(
+                    Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it"
+                )
             if self._session is not None and not self._session.ended.is_set():
                 raise UmbraError(Code.BUSY, f"the rig is in use: {self._session.owner}")
             self._session = Session(owner)
@@ -272,6 +277,16 @@ class Rig:
         with self._lock:
             if self._session is session:
                 self._session = None
+
+    def latch(self) -> None:
+        """From now on nobody gets the devices: an emergency stop. `make_safe` follows."""
+        with self._lock:
+            self._latched = True
+
+    def unlatch(self) -> None:
+        """The emergency stop is over."""
+        with self._lock:
+            self._latched = False
 
     def make_safe(self, *, halt: bool = True) -> list[Future[None]]:
         """Revoke the session and send every device to its safe state, from any thread, at once.

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from daemon.separation import correspondence
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
+from daemon.separation.handedness import reversed_pattern, strength
 from daemon.separation.noise import Noise
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
@@ -102,6 +103,8 @@ class LeastSquares:
         quality = np.zeros(direct.shape[:2], dtype=np.uint16)
         if len(solved) > 1:
             quality |= bits(_disagree(solved), Quality.DISAGREE)
+        if self._periods:
+            quality |= bits(self._mirrored(ready[0], noise), Quality.RESIDUE)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": np.sqrt(direct_var),
             "global_std": np.sqrt(global_var),
@@ -121,6 +124,7 @@ class LeastSquares:
             **self._references.facts(
                 self._references.total(ready[0].solve()[0], self._leakage).source
             ),
+            "mirrors_looked_for": bool(self._periods),
             **ratio,
             "misfit": None if misfit is None else round(misfit, 3),
             "advice": _advice(ratio, misfit),
@@ -203,6 +207,15 @@ class LeastSquares:
         direct_var: Plane = variance * np.float32(wave_var * (2.0 * gain / (1.0 - b)) ** 2)
         total_var: Plane = variance * np.float32(mean_var * total.of_half + total.of_frame)
         return direct, indirect, direct_var, direct_var + total_var
+
+    def _mirrored(self, fit: _Fit, noise: Noise | None) -> NDArray[np.bool_]:
+        """Where the phase runs against the picture's."""
+        _, cosine, sine = fit.solve()
+        wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
+        if wave.ndim == 3:
+            wave = np.asarray(wave.sum(axis=2), dtype=np.complex64)
+        deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
+        return reversed_pattern([wave], strength([wave], deviation))
 
     def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
         mean, _, _ = fit.solve()

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import light_model
-from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import SIGNIFICANT, Judgement, finish
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
+from daemon.separation.handedness import WaveSums, reversed_pattern, strength
 from daemon.separation.noise import Noise
 from daemon.separation.order import Ranked
 from daemon.separation.order_model import BLURS, RATIOS, OrderErrors, fit, simulate
@@ -37,7 +38,8 @@ class TopK:
     """Means of the brightest and darkest samples, less what noise and blur do -> direct, global.
 
     `levels(blur)` gives the levels of the pattern set for `order_model.simulate`. Planes:
-    `direct_std`, `global_std`. An update is 18 in-place maxima and minima.
+    `direct_std`, `global_std`. An update is 18 in-place maxima and minima; with `weights` (of
+    `handedness.WaveSums`), by which a mirror is found, 4 products and sums more.
     """
 
     def __init__(
@@ -48,6 +50,7 @@ class TopK:
         leakage: float,
         levels: Callable[[float], Plane],
         average: int = 1,
+        weights: NDArray[np.complex128] | None = None,
     ) -> None:
         self._response = response
         self._alpha = lit_fraction
@@ -60,6 +63,7 @@ class TopK:
         self._low = Ranked(KEEP, largest=False)
         self._high = Ranked(KEEP, largest=True)
         self._saturated: NDArray[np.bool_] | None = None
+        self._waves = None if weights is None else WaveSums(weights)
         self._models = simulate(levels, KEEP)
         self._unused = 0
 
@@ -75,7 +79,7 @@ class TopK:
         elif self._mean is None:
             if self._low.frames == 0:
                 self._noise.add(pixels, observation.pattern)
-            self._rank(pixels)
+            self._rank(pixels, observation.pattern)
         else:
             if self._open is not None and self._open != observation.pattern:
                 self._close(self._mean)
@@ -88,14 +92,16 @@ class TopK:
             self._close(self._mean)
 
     def _close(self, mean: FrameMean) -> None:
-        if mean.frames:
-            self._rank(mean.value())
+        if mean.frames and self._open is not None:
+            self._rank(mean.value(), self._open)
         mean.clear()
         self._open = None
 
-    def _rank(self, samples: NDArray[Any]) -> None:
+    def _rank(self, samples: NDArray[Any], pattern: int) -> None:
         self._low.add(samples)
         self._high.add(samples)
+        if self._waves is not None:
+            self._waves.add(samples, pattern)
 
     def result(self) -> Components:
         """See `Estimator`. Raises NotYet before two patterns are in; with fewer than two ranks of
@@ -149,12 +155,14 @@ class TopK:
         saturated = self._saturated
         if saturated is None:
             saturated = self._high.planes[0] >= self._response.saturated_from
+        mirrored = self._mirrored(deviation)
         return finish(
             direct,
             indirect,
             response=self._response,
             brightest=high[0],
             saturated=saturated,
+            flags=None if mirrored is None else bits(mirrored, Quality.RESIDUE),
             judgement=Judgement(
                 direct=np.float32(SIGNIFICANT) * np.maximum(planes["direct_std"], rounding),
                 total=np.float32(SIGNIFICANT) * np.maximum(planes["global_std"], rounding),
@@ -173,9 +181,18 @@ class TopK:
                     for ratio, k in zip(RATIOS, () if model is None else model.k, strict=False)
                 },
                 "noise_from": "repeated frames" if self._noise.measured else "ranks",
+                "mirrors_looked_for": mirrored is not None,
                 **self._references.facts(source),
             },
         )
+
+    def _mirrored(self, deviation: Plane) -> NDArray[np.bool_] | None:
+        """Where the pattern lies the wrong way round; None where the scan cannot tell."""
+        waves = None if self._waves is None else self._waves.waves()
+        if self._waves is None or waves is None:
+            return None
+        # ranks hold counts, averages light: near enough for a limit
+        return reversed_pattern(waves, strength(waves, deviation * self._waves.gain))
 
     def _light(self, samples: NDArray[Any]) -> Plane:
         return self._response.linear(samples) if self._mean is None else samples

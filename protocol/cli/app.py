@@ -21,9 +21,11 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "separate": ("separate:separate", "Separate photographs or a video that you already have."),
     },
     "Scans": {
-        "scan": ("scan:app", "Queue a scan: checkerboard, two-image, stick ..."),
+        "scan": ("scan:app", "Queue a scan: checkerboard, two-image, mesh ..."),
         "calibrate": ("scan:calibrate", "Calibrate the rig: dark, noise, leak, tone, latency."),
         "verify": ("scan:verify", "Verify the separation at points, as the paper does (3.5)."),
+        "plan": ("plan:app", "Work out radius, feed and frames of a mesh scan; no rig needed."),
+        "advise": ("scan:advise", "Which pattern, images and exposure this scene needs."),
         "watch": ("watch:watch", "Follow a run: progress, rate, time left."),
         "runs": ("runs:runs", "List runs, the newest first."),
         "run": ("runs:run", "One run in detail."),

@@ -181,7 +181,7 @@ def test_latency_is_found_with_its_spread() -> None:
 def test_a_projector_that_is_on_time_is_not_waited_for() -> None:
     facts = flashes(0.0).result().facts
     assert facts["values"]["latency_s"] == 0.0
-    assert "when the driver says so" in facts["from"]
+    assert "before the first exposure" in facts["from"]
 
 
 def test_a_flash_that_never_comes_is_said() -> None:

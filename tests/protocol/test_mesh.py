@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 from protocol import mesh as geometry
+from protocol.cli.app import run
 from protocol.mesh import Mesh
 from protocol.scans import SUN_DEG, Grid
 
@@ -70,3 +73,16 @@ def test_what_cannot_be_is_said() -> None:
         Mesh(10.0, 10.0)
     with pytest.raises(ValueError, match="never lit"):
         geometry.plan(SQUARE, radius_mm=4.0)
+
+
+def test_the_command_line_plans_without_a_rig(capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["plan", "mesh", "--hole-mm", "6.25", "--pitch-mm", "10"]
+    assert run([*asked, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    best = geometry.best_circle(SQUARE)
+    assert told["radius_mm"] == pytest.approx(best.radius_mm)
+    assert told["hole_fraction"] == pytest.approx(SQUARE.hole_fraction)
+    assert run([*asked, "--scene-mm", "100"]) == 0
+    assert "full light" in capsys.readouterr().out
+    assert run([*asked, "--radius-mm", "4"]) == 2
+    assert "never lit" in capsys.readouterr().err
