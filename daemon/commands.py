@@ -189,6 +189,8 @@ class Commands:
         return Answer(m.Examined(checks=tuple(checks)))
 
     async def _log(self, command: m.GetLog, _: _Asked) -> Answer:
+        if command.run:
+            await asyncio.to_thread(self._store.open, command.run)  # a name that is wrong is said
         return Answer(m.Log(records=self._book.records(command.run, command.limit)))
 
     # ------------------------------------------------------------ runs

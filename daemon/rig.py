@@ -52,6 +52,7 @@ class _Member:
     failures: int = 0
     next_try: float = 0.0
     pending: Future[Any] | None = None  # a connect or check under way
+    stale: Future[Any] | None = None  # one that was asked before the device was seen to be lost
 
     @property
     def device(self) -> Device:
@@ -204,6 +205,7 @@ class Rig:
         if member is None:
             return
         if isinstance(error, DeviceLost) or member.thread.stuck:
+            member.stale = member.pending
             self._set(member, Health.STUCK if member.thread.stuck else Health.LOST, str(error))
 
     def _connecting(self, member: _Member) -> Callable[[Device], None]:
@@ -234,6 +236,9 @@ class Rig:
     def _finish(self, member: _Member, wait_s: float) -> None:
         pending, member.pending = member.pending, None
         if pending is None:
+            return
+        if pending is member.stale and pending.done():
+            member.next_try = time.monotonic()  # what it says is older than the loss
             return
         try:
             if wait_s:
