@@ -99,6 +99,20 @@ def strength(waves: Sequence[Wave], deviation: Plane) -> Plane:
     return np.asarray(weakest / np.maximum(noise, np.float32(1e-6)), dtype=np.float32)
 
 
+def imbalance(waves: Sequence[Wave], strength: Plane) -> float | None:
+    """How unlike two waves' amplitudes are: the median of |A - B|/(A + B), 0 to 1.
+
+    A checkerboard is a product of a part along x and one along y, under any blur, so that one point
+    lit by it has equal amplitudes of x + y and x - y; other frames, or their wrong order, don't.
+    None where hardly any pixel is modulated.
+    """
+    strong = strength > np.float32(STRONG)
+    if len(waves) != 2 or np.count_nonzero(strong) < _WINDOW**2:
+        return None
+    first, second = (np.abs(wave)[strong] for wave in waves)
+    return float(np.median(np.abs(first - second) / (first + second)))
+
+
 def reversed_pattern(waves: Sequence[Wave], strength: Plane) -> Mask:
     """Where the pattern lies the other way round than in most of the picture: (H, W) bool.
 
