@@ -131,6 +131,7 @@ class MeshMethod(OccluderMethod[Mesh]):
 
     def conclude(self, components: Components) -> Components:
         """See `Method`: with the warnings among the facts."""
+        components = super().conclude(components)
         if not self.warnings:
             return components
         return replace(components, facts={**components.facts, "warnings": list(self.warnings)})
