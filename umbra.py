@@ -13,6 +13,7 @@ from protocol.scans import (
     Checkerboard,
     GrayCode,
     Mesh,
+    Point,
     Radiometry,
     RandomBinary,
     RandomPhase,
@@ -21,6 +22,10 @@ from protocol.scans import (
     Sinusoid,
     Stick,
     TwoImage,
+    VerifyCheckerSize,
+    VerifyLitFraction,
+    VerifyPatchSize,
+    VerifyRandomPatterns,
 )
 
 __all__ = [
@@ -38,6 +43,7 @@ __all__ = [
     "Code",
     "GrayCode",
     "Mesh",
+    "Point",
     "Radiometry",
     "RandomBinary",
     "RandomPhase",
@@ -48,5 +54,9 @@ __all__ = [
     "Stick",
     "TwoImage",
     "UmbraError",
+    "VerifyCheckerSize",
+    "VerifyLitFraction",
+    "VerifyPatchSize",
+    "VerifyRandomPatterns",
     "connect",
 ]

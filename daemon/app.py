@@ -26,6 +26,7 @@ import zmq.asyncio
 from daemon import __version__, config, logs
 from daemon.access import Access, check_exposure
 from daemon.commands import Commands
+from daemon.doctor.examination import Doctor
 from daemon.manual import Manual
 from daemon.notify import Notifier
 from daemon.publisher import HIGH_WATER, Publisher
@@ -68,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
             return 0
         book = logs.configure(options.log_level)
         sys.setswitchinterval(_SWITCH_S)
-        asyncio.run(_Daemon(rig_config, book).run(until_eof=options.until_eof))
+        asyncio.run(_Daemon(rig_config, options.config, book).run(until_eof=options.until_eof))
     except config.ConfigError as error:
         print(f"umbrad: {error}", file=sys.stderr)
         return 2
@@ -85,8 +86,9 @@ class StartError(Exception):
 class _Daemon:
     """The process: what is started here is stopped here, in the opposite order."""
 
-    def __init__(self, rig_config: config.RigConfig, book: logs.LogBook) -> None:
+    def __init__(self, rig_config: config.RigConfig, path: Path | None, book: logs.LogBook) -> None:
         self._config = rig_config
+        self._path = path
         self._book = book
         self._notifier = Notifier()
         self._stop = asyncio.Event()
@@ -141,6 +143,14 @@ class _Daemon:
                 store=store,
                 config=self._config,
                 viewfinder=viewfinder,
+                doctor=Doctor(
+                    rig=rig,
+                    manual=manual,
+                    store=store,
+                    config=self._config,
+                    path=self._path,
+                    watchdog_s=self._notifier.watchdog_interval(),
+                ),
                 publisher=publisher,
                 book=self._book,
                 epoch=epoch,

@@ -12,6 +12,7 @@ import numpy as np
 
 from daemon import __version__, discovery, measured, picture, products
 from daemon.config import RigConfig
+from daemon.doctor.examination import Doctor
 from daemon.logs import LogBook
 from daemon.manual import Manual
 from daemon.publisher import Publisher
@@ -42,6 +43,7 @@ class Commands:
         store: Store,
         config: RigConfig,
         viewfinder: Viewfinder,
+        doctor: Doctor,
         publisher: Publisher,
         book: LogBook,
         epoch: str,
@@ -52,6 +54,7 @@ class Commands:
         self._store = store
         self._config = config
         self._viewfinder = viewfinder
+        self._doctor = doctor
         self._publisher = publisher
         self._book = book
         self._epoch = epoch
@@ -63,6 +66,7 @@ class Commands:
             m.GetStatus: self._status,
             m.GetDevices: self._devices,
             m.Discover: self._discover,
+            m.Examine: self._examine,
             m.Submit: self._submit,
             m.GetQueue: self._queue,
             m.MoveQueued: self._move,
@@ -157,6 +161,16 @@ class Commands:
             command.drivers, command.timeout_s, self._config.devices, self._rig.devices()
         )
         return Answer(m.Discovered(searches=searches))
+
+    async def _examine(self, command: m.Examine, asked: _Asked) -> Answer:
+        doctor = self._doctor
+        if not command.passive:
+            self._require_hands(asked)
+        writes = self._runner.current is not None
+        checks = await asyncio.to_thread(doctor.look, run_writes=writes)
+        if not command.passive:
+            checks += await self._by_hand(asked, doctor.expose)
+        return Answer(m.Examined(checks=tuple(checks)))
 
     async def _log(self, command: m.GetLog, _: _Asked) -> Answer:
         return Answer(m.Log(records=self._book.records(command.run, command.limit)))
@@ -301,11 +315,15 @@ class Commands:
     # ------------------------------------------------------------ by hand
 
     async def _by_hand(self, asked: _Asked, act: Callable[[], T]) -> T:
+        self._require_hands(asked)
+        return await asyncio.to_thread(act)
+
+    def _require_hands(self, asked: _Asked) -> None:
+        """Raise UmbraError unless this client may use the devices by hand now."""
         self._manual.admit(asked.token)
         if self._estopped:
             raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
         self._require_no_run()
-        return await asyncio.to_thread(act)
 
     def _require_no_run(self) -> None:
         current = self._runner.current

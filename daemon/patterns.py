@@ -22,6 +22,7 @@ from protocol.patterns import (
     Sinusoid,
     Solid,
     Stripes,
+    Unlit,
 )
 
 LEVELS = 255
@@ -39,6 +40,13 @@ def render(pattern: AnyPattern, width: int, height: int) -> NDArray[np.uint8]:
             return np.full((height, width), round(level * LEVELS), dtype=np.uint8)
         case Sinusoid():
             return _quantised(np.sin(sinusoid_phase(pattern, width, height)))
+        case Unlit(base=base, points=points, size=size):
+            image = render(base, width, height)
+            for x, y in points:
+                left, top = max(x - size // 2, 0), max(y - size // 2, 0)
+                right, below = x - size // 2 + size, y - size // 2 + size
+                image[top : max(below, 0), left : max(right, 0)] = 0
+            return image
         case RandomPhase():
             return _quantised(np.sin(_random_phases(pattern, width, height) + pattern.phase))
         case _:

@@ -120,7 +120,7 @@ class Sequencer:
         self._lit: Expose | None = None
         self._lit_ns = 0
         self._lit_image: NDArray[np.uint8] | None = None
-        self._looks = Proof()
+        self._looks = Proof() if method.looked_at else None
         self.reason = "all steps were exposed"
 
     def run(self, step_index: int, sub: int, taken: int) -> None:
@@ -215,7 +215,8 @@ class Sequencer:
             self._lit_image = None
         else:
             image = self._lit_image = self._image(step)
-            flipped = self._projector.call(lambda p: p.show(image), SHOW_S, self._session)
+            sent = image if self._tone is None else predistorted(image, self._tone)
+            flipped = self._projector.call(lambda p: p.show(sent), SHOW_S, self._session)
             self._lit_ns = flipped + self._latency_ns
 
     def _image(self, step: Expose) -> NDArray[np.uint8]:
@@ -223,10 +224,7 @@ class Sequencer:
         assert step.pattern is not None
         if self._drawn is None or self._drawn[0] != step.pattern:
             info = self._projector.device.info()
-            image = render(step.pattern, info.width, info.height)
-            if self._tone is not None:
-                image = predistorted(image, self._tone)
-            self._drawn = (step.pattern, image)
+            self._drawn = (step.pattern, render(step.pattern, info.width, info.height))
         return self._drawn[1]
 
     def _draw_ahead(self, index: int) -> None:
@@ -325,6 +323,8 @@ class Sequencer:
         if exposure.dark_ns and frame.end_ns > exposure.dark_ns:
             late = (frame.end_ns - exposure.dark_ns) / NS * 1e3
             return f"the exposure ended {late:.2f} ms after its pattern was taken down"
+        if self._looks is None:
+            return ""
         return self._looks.problem(frame.pixels, exposure.step, exposure.image)
 
     # ------------------------------------------------------------ video steps

@@ -51,6 +51,10 @@ SLOW_S = 30.0
 """The least time-out of a command whose own work takes time: an exposure, a large array."""
 
 
+EXAMINE_S = 180.0
+"""An examination exposes, flips and writes: seconds, and a minute with devices that time out."""
+
+
 class command(Generic[P, T]):  # noqa: N801  (a decorator, as property is)
     """Makes a function that returns an Ask into a method of both clients."""
 
@@ -117,6 +121,13 @@ class Commands:
             m.Discover(drivers=drivers, timeout_s=timeout_s),
             lambda a: expect(a.reply, m.Discovered).searches,
             timeout_s + SLOW_S,
+        )
+
+    @command
+    def examine(self, *, passive: bool = False) -> Ask[tuple[m.Check, ...]]:
+        """Look for what is wrong with the rig (`umbra doctor`); `passive` exposes nothing."""
+        return Ask(
+            m.Examine(passive=passive), lambda a: expect(a.reply, m.Examined).checks, EXAMINE_S
         )
 
     @command

@@ -103,6 +103,15 @@ class StageState(enum.StrEnum):
     ALARM = "alarm"
 
 
+class Outcome(enum.StrEnum):
+    """What a check of `doctor` came to."""
+
+    OK = "ok"
+    WARNING = "warning"  # scans work, but not as well as they could
+    FAILED = "failed"  # scans fail, or lie
+    SKIPPED = "skipped"  # it could not be looked at
+
+
 # ---------------------------------------------------------------- facts
 
 
@@ -227,6 +236,15 @@ class Search(Fact, frozen=True, kw_only=True):
     problem: str = ""  # with the remedy
 
 
+class Check(Fact, frozen=True, kw_only=True):
+    """One finding of `doctor`."""
+
+    name: str  # "disk: speed": what was looked at
+    outcome: Outcome
+    message: str
+    remedy: str = ""  # what to do
+
+
 # ---------------------------------------------------------------- commands
 
 
@@ -260,6 +278,16 @@ class Discover(Command, frozen=True, kw_only=True, tag="discover"):
     role: ClassVar[Role] = Role.OPERATOR
     drivers: tuple[str, ...] = ()  # none named: every one that is installed
     timeout_s: Annotated[float, Meta(gt=0, le=120)] = 15.0  # for each; they look side by side
+
+
+class Examine(Command, frozen=True, kw_only=True, tag="doctor"):
+    """Look for what is wrong with the rig. Exposes, as manual work: not while a run goes on.
+
+    `passive` leaves the devices alone, and is answered at any time.
+    """
+
+    role: ClassVar[Role] = Role.OPERATOR
+    passive: bool = False
 
 
 class Submit(Command, frozen=True, kw_only=True, tag="submit"):
@@ -473,10 +501,10 @@ class Unlock(Command, frozen=True, kw_only=True, tag="unlock"):
 
 
 AnyCommand = (
-    Hello | GetStatus | GetDevices | Discover | Submit | GetQueue | MoveQueued | Pause | Resume
-    | Abort | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct | GetLog | GetPreview
-    | Show | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove | StageCircle
-    | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
+    Hello | GetStatus | GetDevices | Discover | Examine | Submit | GetQueue | MoveQueued
+    | Pause | Resume | Abort | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct
+    | GetLog | GetPreview | Show | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove
+    | StageCircle | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
 )  # fmt: skip
 
 
@@ -527,6 +555,12 @@ class Discovered(Reply, frozen=True, kw_only=True, tag="discovered"):
     """Answer to `discover`."""
 
     searches: tuple[Search, ...]
+
+
+class Examined(Reply, frozen=True, kw_only=True, tag="examined"):
+    """Answer to `doctor`: the findings in the order in which they are best repaired."""
+
+    checks: tuple[Check, ...]
 
 
 class Run(Reply, frozen=True, kw_only=True, tag="run"):
@@ -600,8 +634,8 @@ class Done(Reply, frozen=True, kw_only=True, tag="done"):
 
 
 AnyReply = (
-    Welcome | Status | Devices | Discovered | Run | Runs | Result | ProductPart | Log | Picture
-    | Camera | StageStatus | Locked | Done
+    Welcome | Status | Devices | Discovered | Examined | Run | Runs | Result | ProductPart | Log
+    | Picture | Camera | StageStatus | Locked | Done
 )  # fmt: skip
 
 ANSWERS: dict[type[Command], type[Reply]] = {
@@ -609,6 +643,7 @@ ANSWERS: dict[type[Command], type[Reply]] = {
     GetStatus: Status,
     GetDevices: Devices,
     Discover: Discovered,
+    Examine: Examined,
     Submit: Run,
     GetQueue: Runs,
     MoveQueued: Runs,

@@ -96,6 +96,20 @@ class Stripes(Pattern, frozen=True, kw_only=True, tag="stripes"):
     shift: int = 0
 
 
-AnyPattern = Solid | Checker | Sinusoid | RandomPhase | GrayCode | RandomBinary | Stripes
+AnyBinary = Solid | Checker | RandomBinary
+
+
+class Unlit(Pattern, frozen=True, kw_only=True, tag="unlit"):
+    """Another pattern with a square of pixels kept unlit around each of some points (§3.5).
+
+    A square of an odd size has its middle on its point; of an even one, half a pixel before it.
+    """
+
+    base: AnyBinary = Solid(level=1.0)
+    points: tuple[tuple[int, int], ...] = ()  # x, y
+    size: Length = 6
+
+
+AnyPattern = Solid | Checker | Sinusoid | RandomPhase | GrayCode | RandomBinary | Stripes | Unlit
 BLACK = Solid(level=0.0)
 WHITE = Solid(level=1.0)

@@ -22,7 +22,7 @@ from protocol import patterns, scans
 from protocol.connection import ATTEMPTS, EVENTS_HWM, PREVIEWS_HWM
 from protocol.errors import Code, ErrorInfo
 from protocol.following import SILENCE_S
-from protocol.patterns import AnyPattern
+from protocol.patterns import AnyBinary, AnyPattern
 from protocol.scans import AnyScan, Radiometry
 from protocol.wire import encode
 
@@ -119,6 +119,7 @@ _UNIONS = {
     "any event": m.AnyEvent,
     "any scan": AnyScan,
     "any pattern": AnyPattern,
+    "a two-valued pattern": AnyBinary,
 }
 _SECTIONS = {
     "any command": "commands",
@@ -126,6 +127,7 @@ _SECTIONS = {
     "any event": "events",
     "any scan": "scans",
     "any pattern": "patterns",
+    "a two-valued pattern": "patterns",
 }
 
 
@@ -366,7 +368,7 @@ their own {PREVIEWS_HWM} previews; they ask when they have heard nothing for {SI
 ## States
 
 """
-    for states in (m.RunState, m.RigState, m.Health, m.StageState, m.Role):
+    for states in (m.RunState, m.RigState, m.Health, m.StageState, m.Outcome, m.Role):
         yield from _enum(states)
     yield "## Commands\n"
     yield "| command | least role | answer | |"

@@ -82,8 +82,16 @@ def test_decisions_are_numbered_without_gaps_and_have_their_parts() -> None:
 
 @pytest.mark.parametrize("page", [p for p in PAGES if any(fences(p, "toml"))], ids=name)
 def test_examples_of_rig_toml_are_accepted(page: Path) -> None:
+    missing = ""
     for text in fences(page, "toml"):
-        config.parse(text, name(page))
+        try:
+            config.parse(text, name(page))
+        except config.ConfigError as error:
+            if "pip install" not in str(error):
+                raise
+            missing = str(error)  # a driver's extra: the other examples are tried all the same
+    if missing:
+        pytest.skip(missing)
 
 
 def test_the_installed_example_is_accepted() -> None:

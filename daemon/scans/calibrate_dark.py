@@ -15,6 +15,7 @@ class DarkMethod(MeasuringMethod[CalibrateDark]):
     """All sources off, the exposure doubled from step to step up to the run's own."""
 
     name: ClassVar[str] = "calibrate-dark"
+    looked_at: ClassVar[bool] = False
 
     def __init__(self, spec: CalibrateDark, bench: Bench) -> None:
         super().__init__(spec, bench)

@@ -26,6 +26,7 @@ class LatencyMethod(MeasuringMethod[CalibrateLatency]):
     """
 
     name: ClassVar[str] = "calibrate-latency"
+    looked_at: ClassVar[bool] = False
 
     def __init__(self, spec: CalibrateLatency, bench: Bench) -> None:
         super().__init__(spec, bench)

@@ -18,6 +18,7 @@ class NoiseMethod(MeasuringMethod[CalibrateNoise]):
     """At several exposures a frame to sort by and pairs, under white or what light there is."""
 
     name: ClassVar[str] = "calibrate-noise"
+    looked_at: ClassVar[bool] = False
 
     def __init__(self, spec: CalibrateNoise, bench: Bench) -> None:
         super().__init__(spec, bench)

@@ -17,6 +17,7 @@ class ToneMethod(MeasuringMethod[CalibrateTone]):
     """White and black, the levels between them, and white again."""
 
     name: ClassVar[str] = "calibrate-tone"
+    looked_at: ClassVar[bool] = False
 
     def __init__(self, spec: CalibrateTone, bench: Bench) -> None:
         super().__init__(spec, bench)

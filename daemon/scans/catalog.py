@@ -18,6 +18,10 @@ from daemon.scans.single_image import SingleImageMethod
 from daemon.scans.sinusoid import RandomPhaseMethod, SinusoidMethod
 from daemon.scans.stick import StickMethod
 from daemon.scans.two_image import TwoImageMethod
+from daemon.scans.verify_checker_size import VerifyCheckerSizeMethod
+from daemon.scans.verify_lit_fraction import VerifyLitFractionMethod
+from daemon.scans.verify_patch_size import VerifyPatchSizeMethod
+from daemon.scans.verify_random_patterns import VerifyRandomPatternsMethod
 from protocol.scans import (
     AnyScan,
     CalibrateDark,
@@ -34,6 +38,10 @@ from protocol.scans import (
     Sinusoid,
     Stick,
     TwoImage,
+    VerifyCheckerSize,
+    VerifyLitFraction,
+    VerifyPatchSize,
+    VerifyRandomPatterns,
 )
 
 _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
@@ -51,6 +59,10 @@ _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     CalibrateLeak: LeakMethod,
     CalibrateTone: ToneMethod,
     CalibrateLatency: LatencyMethod,
+    VerifyPatchSize: VerifyPatchSizeMethod,
+    VerifyRandomPatterns: VerifyRandomPatternsMethod,
+    VerifyLitFraction: VerifyLitFractionMethod,
+    VerifyCheckerSize: VerifyCheckerSizeMethod,
 }
 
 NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())

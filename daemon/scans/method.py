@@ -115,6 +115,7 @@ class Method(ABC, Generic[S]):
     """A scan in its course. Made from a validated spec and a bench; pure."""
 
     name: ClassVar[str]
+    looked_at: ClassVar[bool] = True  # a frame must look like its pattern: see daemon.proof
 
     def __init__(self, spec: S, bench: Bench) -> None:
         """Raises Unsuitable when the rig lacks what the scan needs, or the numbers don't fit."""

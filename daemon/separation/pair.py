@@ -31,6 +31,7 @@ class ComplementPair:
         self._references = References(response)
         self._means = (FrameMean(response), FrameMean(response))
         self._noise = ScanNoise(response, average)
+        self._average = average
         self._saturated: NDArray[np.bool_] | None = None
         self._unused = 0
 
@@ -62,6 +63,7 @@ class ComplementPair:
         ambient, source = self._ambient(first, second)
         lit, unlit = (first, second) if ambient is None else (first - ambient, second - ambient)
         brightest = np.maximum(first, second)
+        deviation = self._noise.deviation(brightest)
         direct, indirect = light_model.from_complement_pair(lit, unlit, self._alpha, self._leakage)
         return finish(
             direct,
@@ -69,7 +71,8 @@ class ComplementPair:
             response=self._response,
             brightest=brightest,
             saturated=self._saturated,
-            judgement=Judgement.of_extremes(self._noise.deviation(brightest), 2),
+            planes=self._deviations(deviation),
+            judgement=Judgement.of_extremes(deviation, 2),
             facts={
                 "estimator": "complement pair",
                 "patterns": 2,
@@ -81,6 +84,21 @@ class ComplementPair:
                 **self._residual(first, second),
             },
         )
+
+    def _deviations(self, deviation: Plane) -> dict[str, NDArray[Any]]:
+        """Standard deviations of direct and global from noise; edges of checkers, which are the
+        greater error of two images, are not noise."""
+        b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
+        h = light_model.global_weight(1.0 - self._alpha, b)
+        least = min(light_model.complement_determinants(self._alpha, b))
+        ambient = 0.0  # of its variance in one frame's, in L_g = (I_unlit - A - b(I_lit - A))/det
+        for kind in (Lighting.AMBIENT, Lighting.BLACK):
+            if not ambient and self._references.frames(kind):
+                ambient = self._average * (1.0 - b) ** 2 / self._references.frames(kind)
+        return {
+            "direct_std": deviation * np.float32(np.hypot(g, h) / least),
+            "global_std": deviation * np.float32(np.sqrt(1.0 + b * b + ambient) / least),
+        }
 
     def _ambient(self, first: Plane, second: Plane) -> tuple[Plane | None, str]:
         """Ambient light; a black frame's leakage is (L_d + L_g) b, and P + I = 2A + (1 + b) times

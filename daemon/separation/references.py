@@ -71,16 +71,29 @@ class References:
         weight = 2.0 / (1.0 - leakage)
         total: Plane = (half - black) * np.float32(weight)
         share = weight**2 / self.frames(Lighting.BLACK)
-        white = self.mean(Lighting.WHITE)
-        if white is None or self._white_saturated is None:
+        whole = self.whole(leakage)
+        if whole is None or self._white_saturated is None:
             return Total(total, weight**2, share, "black frame")
-        whole: Plane = (white - black) * np.float32(1.0 / (1.0 - leakage))
         if self._white_saturated.any():
-            total = np.where(self._white_saturated, total, whole)
-            return Total(total, weight**2, share, "black and white frames")
+            total = np.where(self._white_saturated, total, whole.light)
+            return Total(total, weight**2, share, whole.source)
+        return whole
+
+    def whole(self, leakage: float) -> Total | None:
+        """L_d + L_g = (W - K)/(1 - b), whatever the ambient light; None without both frames. Wrong
+        where `white_saturated`."""
+        black, white = self.mean(Lighting.BLACK), self.mean(Lighting.WHITE)
+        if black is None or white is None:
+            return None
+        light: Plane = (white - black) * np.float32(1.0 / (1.0 - leakage))
         frames = 1.0 / self.frames(Lighting.BLACK) + 1.0 / self.frames(Lighting.WHITE)
         share = frames / (1.0 - leakage) ** 2
-        return Total(whole, 0.0, share, "black and white frames")
+        return Total(light, 0.0, share, "black and white frames")
+
+    @property
+    def white_saturated(self) -> NDArray[np.bool_] | None:
+        """Samples that were saturated in a white frame."""
+        return self._white_saturated
 
     def share(self, source: str) -> float:
         """The variance of `ambient` for one frame's, to first order in the leakage."""

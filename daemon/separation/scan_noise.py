@@ -86,6 +86,14 @@ class ResidualNoise:
         """Whether it is measured, not an upper bound."""
         return self._fitted() is not None
 
+    @property
+    def misfit(self) -> float | None:
+        """What the fit leaves over what a picture shows: far above 1, frames are no sinusoid."""
+        fitted = self._fitted()
+        if fitted is None or self._picture is None:
+            return None
+        return fitted.typical / self._picture.typical
+
     def noise(self) -> Noise | None:
         """Deviation of one frame's counts by level."""
         return self._fitted() or self._picture

@@ -31,6 +31,11 @@ _DISAGREE_PART = 0.1
 """... and by this part of the light: a smaller difference is a bend of the projector's curve."""
 
 
+_MISFIT = 5.0
+"""So far above a picture's noise, what the fit leaves is not noise."""
+_MEAN_OFF = 0.03
+
+
 class LeastSquares:
     """Frames of N >= 3 phases of one or several sinusoids -> direct, global, φ.
 
@@ -103,6 +108,7 @@ class LeastSquares:
         }
         planes.update(self._correspondence(ready))
         ratio = self._mean_ratio(ready[0])
+        misfit = self._noise.misfit
         facts: dict[str, Any] = {
             "estimator": "lsq",
             "patterns": sum(fit.frames for fit in self._fits),
@@ -116,7 +122,8 @@ class LeastSquares:
                 self._references.total(ready[0].solve()[0], self._leakage).source
             ),
             **ratio,
-            "advice": _advice(ratio),
+            "misfit": None if misfit is None else round(misfit, 3),
+            "advice": _advice(ratio, misfit),
         }
         return finish(
             direct,
@@ -300,12 +307,20 @@ def _disagree(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> NDArray[np.boo
     return differ if differ.ndim == 2 else np.asarray(np.logical_or.reduce(differ, axis=2))
 
 
-def _advice(ratio: dict[str, float]) -> list[str]:
+def _advice(ratio: dict[str, float], misfit: float | None) -> list[str]:
+    """What to do about frames that are no sinusoids in time; [] where they are."""
+    lines = []
+    if misfit is not None and misfit > _MISFIT:
+        lines.append(
+            f"the frames are {misfit:.0f} times further from a sinusoid than noise takes them: "
+            "they are not the phases that were declared (--phases, --periods), the tone curve is "
+            "not linear, or something moved"
+        )
     found = ratio.get("mean_ratio")
-    if found is None or abs(found - 1.0) < 0.03:
-        return []
-    return [
-        f"the mean over the phases is {found:.2f} of half the light, not 1: the projector's or the "
-        "camera's tone curve is not linear, and global is wrong by as much: run `umbra calibrate "
-        "tone`, or give the camera's curve with --tone"
-    ]
+    if found is not None and abs(found - 1.0) >= _MEAN_OFF:
+        lines.append(
+            f"the mean over the phases is {found:.2f} of half the light, not 1: the projector's or "
+            "the camera's tone curve is not linear, and global is wrong by as much: run `umbra "
+            "calibrate tone`, or give the camera's curve with --tone"
+        )
+    return lines

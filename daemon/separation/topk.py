@@ -134,8 +134,16 @@ class TopK:
             - covariance * np.float32(2 * share / g)
             + np.square(deviation) * np.float32(reference * self._average)
         )
+        direct_std = step_std * np.float32(1.0 / (1.0 - b))
+        whole, clipped = self._references.whole(b), self._references.white_saturated
+        if whole is not None and clipped is not None:
+            # W - K holds half as much noise of the references as the darkest samples less K
+            source = whole.source
+            alone = direct_std**2 + deviation**2 * np.float32(whole.of_frame * self._average)
+            np.copyto(indirect, whole.light - direct, where=~clipped)
+            np.copyto(global_var, alone, where=~clipped)
         planes: dict[str, NDArray[Any]] = {
-            "direct_std": step_std * np.float32(1.0 / (1.0 - b)),
+            "direct_std": direct_std,
             "global_std": np.sqrt(np.maximum(global_var, 0)),
         }
         saturated = self._saturated

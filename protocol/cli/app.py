@@ -23,6 +23,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "Scans": {
         "scan": ("scan:app", "Queue a scan: checkerboard, two-image, mesh ..."),
         "calibrate": ("scan:calibrate", "Calibrate the rig: dark, noise, leak, tone, latency."),
+        "verify": ("scan:verify", "Verify the separation at points, as the paper does (3.5)."),
         "plan": ("plan:app", "Work out radius, feed and frames of a mesh scan; no rig needed."),
         "watch": ("watch:watch", "Follow a run: progress, rate, time left."),
         "runs": ("runs:runs", "List runs, the newest first."),
@@ -36,6 +37,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "The rig": {
         "status": ("rig:status", "What the rig is doing now."),
         "devices": ("rig:devices", "The devices and their health."),
+        "doctor": ("doctor:doctor", "What is wrong with the rig, and what to do about it."),
         "methods": ("rig:methods", "The scan methods that the daemon knows."),
         "log": ("rig:log", "The last log records of a run, or of the daemon."),
         "stop": ("rig:stop", "Emergency stop: safe state now, until `umbra reset`."),

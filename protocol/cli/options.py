@@ -20,7 +20,12 @@ from protocol.errors import Code, UmbraError
 
 T = TypeVar("T", bound=msgspec.Struct)
 
-SHORT = {"leakage": ("--leak",), "lit_fraction": ("--alpha",), "exposure_us": ("--exposure",)}
+SHORT = {
+    "points": ("--point",),
+    "leakage": ("--leak",),
+    "lit_fraction": ("--alpha",),
+    "exposure_us": ("--exposure",),
+}
 """Further names of options, by field."""
 
 
@@ -35,6 +40,7 @@ class Option:
     default: Any = None
     help: str = ""
     required: bool = False
+    fields: tuple[str, ...] = ()  # of a list of structs: those that each value gives, in order
 
     @property
     def name(self) -> str:
@@ -68,6 +74,8 @@ class Option:
         """How the value is written in the help."""
         if self.kind is bool:
             return None
+        if self.fields:
+            return ",".join(self.fields)
         if self.item is not None:
             return ",".join([(self.item.__name__ if not self.choices else "name").upper(), "..."])
         if 1 < len(self.choices) <= 4:
@@ -84,8 +92,23 @@ class Option:
         text = "; ".join(facts)
         return text[:1].upper() + text[1:]
 
+    def _struct_of(self, text: str) -> dict[str, Any]:
+        """[NAME=]VALUE,VALUE,... as a struct's fields. Raises UmbraError(bad_request)."""
+        name, _, rest = text.rpartition("=")
+        try:
+            values = [float(part) for part in rest.split(",")]
+            found: dict[str, Any] = dict(zip(self.fields, values, strict=True))
+        except ValueError:
+            wanted = ",".join(self.fields)
+            raise UmbraError(
+                Code.BAD_REQUEST, f"{self.flag}: {text!r} is not [NAME=]{wanted}", self.flag
+            ) from None
+        return found | ({"name": name} if name else {})
+
     def value_of(self, given: Any) -> Any:
         """A given value as msgspec expects it. Raises UmbraError(bad_request)."""
+        if self.fields:
+            return [self._struct_of(text) for text in given]
         if self.item is not None:
             parts = [part.strip() for part in str(given).split(",") if part.strip()]
             try:
@@ -152,6 +175,9 @@ def _option(
         case shape.VarTupleType() | shape.ListType() | shape.TupleType():
             first = kind.item_types[0] if isinstance(kind, shape.TupleType) else kind.item_type
             inner, _ = _bare(first)
+            if isinstance(inner, shape.StructType) and inner.tag is None:
+                fields = tuple(f.encode_name for f in inner.fields if f.required)
+                return Option(path, list[str], (), None, None, text, required, fields)
             one = _option(path, inner, None, "", required=False)
             if one is None or one.item is not None:
                 return None

@@ -30,7 +30,7 @@ COLOURS = {
     "finishing": "cyan", "queued": "blue", "manual": "blue", "paused": "yellow",
     "interrupted": "yellow", "aborted": "yellow", "lost": "red", "fault": "red", "stuck": "red",
     "failed": "red", "estopped": "red", "stopping": "yellow", "homing": "cyan", "moving": "cyan",
-    "held": "yellow", "alarm": "red",
+    "held": "yellow", "alarm": "red", "ok": "green", "warning": "yellow",
 }  # fmt: skip
 
 

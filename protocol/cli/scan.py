@@ -22,7 +22,7 @@ from protocol.cli.watch import conclude, follow, goes_on
 from protocol.cli.words import Fetched
 from protocol.errors import Code, UmbraError
 from protocol.messages import Run
-from protocol.scans import AnyCalibration, AnyScan, AnySeparation
+from protocol.scans import AnyCalibration, AnyScan, AnySeparation, AnyVerification
 
 
 def scan(
@@ -83,6 +83,24 @@ class Methods(Family):
     title = "Methods"
 
 
+class Calibrations(Family):
+    """One command a calibration."""
+
+    union = AnyCalibration
+    act = scan
+    title = "Calibrations"
+    prefix = "calibrate-"
+
+
+class Verifications(Family):
+    """One command an experiment of §3.5."""
+
+    union = AnyVerification
+    act = scan
+    title = "Experiments"
+    prefix = "verify-"
+
+
 def spec_in(file: Path) -> AnyScan:
     """The spec in a TOML or JSON file: `method` and its fields. Raises UmbraError(bad_request)."""
     try:
@@ -95,15 +113,6 @@ def spec_in(file: Path) -> AnyScan:
         message = str(error).replace("`", "").replace("Object contains", "there is an")
         raise UmbraError(Code.BAD_REQUEST, f"{file}: {message}", "--file") from error
     return spec
-
-
-class Calibrations(Family):
-    """One command a calibration."""
-
-    union = AnyCalibration
-    act = scan
-    title = "Calibrations"
-    prefix = "calibrate-"
 
 
 def _scan(
@@ -161,4 +170,18 @@ def _calibrate(context: typer.Context, rig: Rig = None, keys: Keys = None) -> No
         typer.echo(context.get_help())
 
 
-__all__: list[Any] = ["app", "calibrate", "scan"]
+verify = typer.Typer(cls=Verifications, rich_markup_mode=None, add_completion=False)
+
+
+@verify.callback(invoke_without_command=True)
+def _verify(context: typer.Context, rig: Rig = None, keys: Keys = None) -> None:
+    """Queue a verification experiment of the paper (3.5); prints the run's id.
+
+    Points of interest are camera pixels: --point 320,240 or --point wall=320,240, several times.
+    --wait and -o DIR as in `umbra scan`.
+
+    --json: a Run; with -o {"run": RunInfo, "files": [path, ...]}.
+    """
+    context.obj = {"rig": rig, "keys": keys}
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())

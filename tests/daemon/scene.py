@@ -37,6 +37,7 @@ class Scene:
     blur: float = 0.0  # of the projector, px
     reach: float = 40.0  # of global light, px
     gamma: float = 1.0  # of the projector
+    pixel_format: PixelFormat = PixelFormat.MONO16
     change: Callable[[NDArray[Any], Expose], NDArray[Any]] = field(default=lambda light, _: light)
 
     def __post_init__(self) -> None:
@@ -68,12 +69,15 @@ class Scene:
             around = cv2.GaussianBlur(around, (0, 0), self.reach, borderType=cv2.BORDER_REFLECT)
             light = light + emitted * self.direct + around * self.indirect
         light = self.change(light, step) + rng.normal(0, 1, light.shape) * self.sigma * FULL
-        return np.asarray(np.rint(np.clip(light, 0, FULL)), dtype=np.uint16)
+        counts = np.asarray(np.rint(np.clip(light, 0, FULL)), dtype=np.uint16)
+        # a colour camera sees the same grey scene in each of its channels
+        channels = self.pixel_format.channels
+        return counts if channels == 1 else np.repeat(counts[..., None], channels, axis=2)
 
     def bench(self) -> Bench:
         """A live bench that sees it."""
         return Bench(
-            CameraInfo(self.width, self.height, PixelFormat.MONO16),
+            CameraInfo(self.width, self.height, self.pixel_format),
             ProjectorInfo(self.width, self.height, refresh_hz=60),
         )
 
@@ -90,9 +94,9 @@ class Scene:
                 estimator.update(self.frame(step, rng), observation)
             index += 1
         assert index
-        components = estimator.result()
-        assert isinstance(components, Components)
-        return method.conclude(components)
+        result = estimator.result()
+        assert isinstance(result, Components)
+        return method.conclude(result)
 
 
 DARK = Expose(BLACK)

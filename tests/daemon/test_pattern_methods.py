@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Components, Quality
+from drivers.base import PixelFormat
 from protocol.patterns import Axis
 from protocol.scans import (
     AnyScan,
@@ -106,7 +107,12 @@ def test_the_newest_image_of_a_stream_is_the_result() -> None:
 
 def test_fitted_deviations_are_those_of_repeated_scans() -> None:
     """What is stated against what ten scans do, for the methods that state it."""
-    for spec in (Sinusoid(phases=6), RandomPhase(phases=5), GrayCode(average=2)):
+    for spec in (
+        Sinusoid(phases=6),
+        RandomPhase(phases=5),
+        GrayCode(average=2),
+        TwoImage(average=3),
+    ):
         scene = Scene(sigma=0.01, ambient=0.06)
         runs = [scene.scan(spec, seed=seed) for seed in range(10)]
         for name in ("direct", "global"):
@@ -126,3 +132,24 @@ def test_an_exposure_that_saturates_is_flagged() -> None:
     for spec in (Checkerboard(), Sinusoid(), GrayCode(), RandomBinary()):
         quality = scene.scan(spec).quality
         assert ((quality & np.uint16(Quality.SATURATED)) != 0).mean() > 0.2
+
+
+@pytest.mark.parametrize("pixel_format", [PixelFormat.BAYER_GB16, PixelFormat.RGB16])
+@pytest.mark.parametrize(
+    "spec",
+    [*SPECS, SingleImage(window=5, radiometry=radiometry())],
+    ids=lambda s: f"{type(s).__name__}-{s.average}",
+)
+def test_colour_cameras_see_a_grey_scene_in_grey(spec: AnyScan, pixel_format: PixelFormat) -> None:
+    grey = Scene(leakage=LEAK).scan(spec)
+    colour = Scene(leakage=LEAK, pixel_format=pixel_format).scan(spec)
+    assert colour.direct.shape == colour.global_.shape == (*grey.direct.shape, 3)
+    assert colour.quality.shape == grey.quality.shape
+    for name in ("direct", "global_"):
+        apart = getattr(colour, name) - getattr(grey, name)[..., None]
+        # a mosaic's colours are interpolated, and its stripes are seen at half the resolution
+        coarse = isinstance(spec, SingleImage) and pixel_format.bayer
+        assert float(np.sqrt(np.mean(apart**2))) < (0.2 if coarse else 0.012) * FULL
+    for name, plane in colour.planes.items():
+        assert plane.shape[:2] == grey.direct.shape
+        assert (plane.ndim == 3) == name.endswith("_std")

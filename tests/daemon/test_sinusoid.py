@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.scans import catalog
+from daemon.scans.method import Expose
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.radiometry import Response
 from daemon.separation.sinusoid import LeastSquares
@@ -206,3 +208,24 @@ def test_two_periods_give_back_what_blur_takes() -> None:
     assert left == pytest.approx(1.0, abs=0.015)
     assert two.facts["blur_px"] == pytest.approx(0.8, abs=0.15)
     assert ((two.quality & np.uint16(Quality.DISAGREE)) != 0).mean() < 0.01
+
+
+def test_phases_declared_wrongly_are_told_of() -> None:
+    """Eight phases of one period, declared as four of each of two."""
+    scene = Scene(sigma=0.003)
+    rng = np.random.default_rng(1)
+    eight = catalog.method_for(Spec(phases=8, references=()), scene.bench())
+    frames = []
+    for index in range(8):
+        step = eight.step(index, {})
+        assert isinstance(step, Expose)
+        frames.append(scene.frame(step, rng))
+    advice = {}
+    for phases, periods in ((8, (16.0,)), (4, (16.0, 24.0))):
+        spec = Spec(phases=phases, periods=periods, references=())
+        estimator = catalog.method_for(spec, scene.bench()).estimator()
+        for index, frame in enumerate(frames):
+            estimator.update(frame, Observation(pattern=index))
+        advice[phases] = estimator.result().facts["advice"]
+    assert advice[8] == []
+    assert "--phases" in advice[4][0]

@@ -62,6 +62,7 @@ class FakeRig:
             "direct": np.arange(12, dtype=np.float32).reshape(3, 4),
             "global": np.full((3, 4), 2.5, np.float32),
         }
+        self.checks: tuple[m.Check, ...] = ()
         self.files: dict[str, bytes] = {}
         self.runs: dict[str, RunInfo] = {}
         self.lock: m.Locked | None = None
@@ -287,6 +288,8 @@ class FakeRig:
                 return m.Discovered(
                     searches=tuple(m.Search(kind="camera", driver=d) for d in drivers)
                 ), {}
+            case m.Examine():
+                return m.Examined(checks=self.checks), {}
             case m.Lock(lease_s=lease_s):
                 self.lock = m.Locked(token=uuid.uuid4().hex, lease_s=lease_s)
                 return self.lock, {}

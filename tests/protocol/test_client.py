@@ -61,6 +61,7 @@ def test_each_command_has_a_method_and_the_answer_it_names(fake: FakeRig, rig: C
     assert rig.stage() == rig.stage_home() == rig.stage_move(1, 2, 3) == STAGE
     assert rig.stage_circle((9, 9), 3, 2) == rig.stage_stop() == rig.stage_unlock() == STAGE
     assert rig.discover("pylon") == (m.Search(kind="camera", driver="pylon"),)
+    assert rig.examine() == ()
     rig.token = rig.lock("me").token
     assert rig.renew_lock().lease_s == 10.0
     assert rig.unlock() == ""

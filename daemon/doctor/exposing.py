@@ -1,0 +1,201 @@
+"""Trigger, light and latency, found out by exposing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from daemon.devicethread import DeviceThread, Session
+from daemon.doctor.verdict import failed, ok, skipped, warning
+from drivers.base import Acquisition, Camera, DeviceRefused, Light, Projector
+from drivers.clock import NS, Clock
+from protocol.messages import Check
+
+SHOTS = 4
+SETTLE_S = 0.3
+"""Longer than any projector's latency: before it is known there is no event to wait for."""
+_PATIENCE_S = 2.0
+_CALL_S = 5.0
+_LATE_S = 0.25
+_SEEN = 0.01  # of full scale: what light must change at least
+_SATURATED = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One triggered frame: its brightness (of full scale), its times, ns on the rig's clock."""
+
+    mean: float
+    saturated: float
+    asked_ns: int
+    start_ns: int
+    end_ns: int
+    here_ns: int
+    exposure_us: float
+    sequence: int
+
+
+def shoot(camera: DeviceThread[Camera], session: Session, count: int = 1) -> list[Shot]:
+    """Trigger so many frames, each when the one before is here. Raises DeviceError."""
+
+    def act(device: Camera) -> list[Shot]:
+        info = device.info()
+        full = info.pixel_format.full_scale
+        out = np.zeros(info.shape, info.pixel_format.dtype)
+        exposure_us = device.settings().exposure_us or 0.0
+        shots = []
+        device.start(Acquisition.SOFTWARE)
+        try:
+            for _ in range(count):
+                asked = device.clock.now_ns()
+                device.trigger()
+                frame = device.grab(out, exposure_us * 1e-6 + info.readout_s + _PATIENCE_S)
+                shots.append(
+                    Shot(
+                        mean=float(frame.pixels.mean()) / full,
+                        saturated=float(np.count_nonzero(frame.pixels >= full) / out.size),
+                        asked_ns=asked,
+                        start_ns=frame.start_ns,
+                        end_ns=frame.end_ns,
+                        here_ns=device.clock.now_ns(),
+                        exposure_us=frame.exposure_us or exposure_us,
+                        sequence=frame.sequence,
+                    )
+                )
+        finally:
+            device.stop()
+        return shots
+
+    exposure_s = (camera.device.settings().exposure_us or 0.0) * 1e-6
+    return camera.call(act, count * (exposure_s + _PATIENCE_S) + _CALL_S, session)
+
+
+def trigger(shots: Sequence[Shot]) -> Check:
+    """Whether each trigger gave one frame, in a plausible time."""
+    name = "camera: trigger"
+    latency_s = float(np.median([s.start_ns - s.asked_ns for s in shots])) / NS
+    here_s = float(np.median([s.here_ns - s.end_ns for s in shots])) / NS
+    told = (
+        f"{len(shots)} triggers, {len(shots)} frames; exposure begins {latency_s * 1e3:.2f} ms "
+        f"after the trigger, the frame is here {here_s * 1e3:.1f} ms after its end"
+    )
+    steps = {b.sequence - a.sequence for a, b in pairwise(shots)}
+    if steps - {1}:
+        return warning(
+            name,
+            "frames came that no trigger asked for, or were lost between two triggers",
+            "is a second trigger wired to the camera? check its trigger settings",
+        )
+    if any(s.end_ns < s.start_ns or s.start_ns < s.asked_ns - NS // 1000 for s in shots):
+        return failed(
+            name,
+            f"a frame says that it began {-latency_s * 1e3:.1f} ms before its trigger",
+            "its clock is not mapped well: unplug the camera and plug it in again",
+        )
+    if latency_s > _LATE_S or here_s > _LATE_S:
+        return warning(name, told, "a busy bus or host: use another port, a smaller roi")
+    return ok(name, told)
+
+
+def periods(exposure_us: float, refresh_hz: float) -> Check:
+    """Whether an exposure is a whole number of the projector's periods."""
+    name = "camera: exposure"
+    ratio = exposure_us * 1e-6 * refresh_hz
+    told = f"{exposure_us / 1e3:.2f} ms are {ratio:.2f} periods of the projector"
+    if ratio > 0.98 and abs(ratio - round(ratio)) < 0.02 * max(1.0, ratio):
+        return ok(name, told)
+    whole = max(1, round(ratio)) / refresh_hz * 1e6
+    return warning(
+        name,
+        f"{told}: one that flickers (colour wheel, PWM) makes stripes and noise",
+        f"umbra camera --exposure {whole:.0f}",
+    )
+
+
+def lit(name: str, dark: Shot, light: Shot) -> list[Check]:
+    """Whether light changes the frame, and does not saturate it."""
+    gain = light.mean - dark.mean
+    told = f"dark {100 * dark.mean:.1f} %, lit {100 * light.mean:.1f} % of full scale"
+    if gain < _SEEN:
+        return [
+            failed(
+                name,
+                f"the light does not reach the camera: {told}",
+                "lens cap, input of the projector, framing; or a longer exposure",
+            )
+        ]
+    if light.saturated > _SATURATED:
+        return [
+            warning(
+                name,
+                f"{told}, {100 * light.saturated:.1f} % of the pixels saturated",
+                f"umbra camera --exposure {light.exposure_us / 2:.0f}, or close the aperture",
+            )
+        ]
+    return [ok(name, told)]
+
+
+def latency(dark: Shot, early: Shot, light: Shot) -> Check:
+    """Whether a frame that began right after the flip has all of the light."""
+    name = "projector: latency"
+    share = (early.mean - dark.mean) / (light.mean - dark.mean)
+    if 0.97 < share < 1.03:
+        return ok(name, "a frame that begins at the flip has all of its light")
+    missing_ms = (1 - share) * early.exposure_us / 1e3
+    return failed(
+        name,
+        f"a frame that begins at the flip has {100 * share:.0f} % of its light: it comes some "
+        f"{missing_ms:.1f} ms later than the projector says",
+        "umbra calibrate latency, which scans then apply",
+    )
+
+
+def projector_checks(
+    camera: DeviceThread[Camera],
+    projector: DeviceThread[Projector],
+    session: Session,
+    clock: Clock,
+) -> list[Check]:
+    """Black, white at once, white settled. Raises DeviceError."""
+    info = projector.device.info()
+    black, white = (np.full((info.height, info.width), level, np.uint8) for level in (0, 255))
+    projector.call(lambda p: p.show(black), _CALL_S, session)
+    clock.wait(SETTLE_S, session.ended)
+    [dark] = shoot(camera, session)
+    projector.call(lambda p: p.show(white), _CALL_S, session)
+    [early] = shoot(camera, session)
+    clock.wait(SETTLE_S, session.ended)
+    [light] = shoot(camera, session)
+    checks = lit("projector: light", dark, light)
+    if light.mean - dark.mean >= _SEEN:
+        checks.append(latency(dark, early, light))
+    projector.call(lambda p: p.safe(), _CALL_S, session)
+    checks.append(periods(light.exposure_us, info.refresh_hz))
+    return checks
+
+
+def light_checks(
+    camera: DeviceThread[Camera], name: str, light: DeviceThread[Light], session: Session
+) -> list[Check]:
+    """A light off, then on, then off; the sun cannot be switched off. Raises DeviceError."""
+
+    def switch(on: bool) -> Callable[[Light], None]:
+        return lambda device: device.set(on)
+
+    try:
+        light.call(switch(False), _CALL_S, session)
+    except DeviceRefused as error:
+        return [skipped(f"light: {name}", error.problem)]
+    [dark] = shoot(camera, session)
+    light.call(switch(True), _CALL_S, session)
+    [bright] = shoot(camera, session)
+    light.call(switch(False), _CALL_S, session)
+    return lit(f"light: {name}", dark, bright)
+
+
+def recorded() -> Check:
+    """A folder of pictures cannot be triggered."""
+    return skipped("camera: trigger", "the camera is a recording")
