@@ -131,6 +131,10 @@ class OccluderScan(Scan, frozen=True, kw_only=True):
     sun: Annotated[
         bool, Meta(description="the source drifts and clouds pass: follow its strength")
     ] = False
+    drift_deg: Annotated[
+        Positive,
+        Meta(description="how far the sun may have gone when an interrupted scan is resumed"),
+    ] = 1.0
     #: None: all of the rig
     lights: Annotated[tuple[str, ...], Meta(description="sources to switch on, by name")] | None = (
         None
