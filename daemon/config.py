@@ -54,6 +54,16 @@ class StorageSection(_Section, frozen=True, kw_only=True):
 
     reserve_mb: Annotated[int, Meta(ge=0)] = 1024  # a run pauses before free space falls below
     keep_frames: bool = True  # False: a recording's own files are the originals
+    keep_days: Annotated[float, Meta(gt=0)] | None = None  # older runs are deleted; None: never
+    keep_gb: Annotated[float, Meta(gt=0)] | None = None  # ... and the oldest beyond this
+
+
+class HooksSection(_Section, frozen=True, kw_only=True):
+    """[hooks]: commands that are run when a run has ended, its JSON on their standard input."""
+
+    done: tuple[str, ...] = ()  # the program and its arguments; no shell
+    failed: tuple[str, ...] = ()  # also after an interruption
+    timeout_s: Annotated[float, Meta(gt=0)] = 60.0
 
 
 class SequencerSection(_Section, frozen=True, kw_only=True):
@@ -87,6 +97,7 @@ class RigConfig(_Section, frozen=True, kw_only=True):
     storage: StorageSection
     sequencer: SequencerSection
     calibration: CalibrationSection
+    hooks: HooksSection
     devices: tuple[DeviceTable, ...]
 
     def device(self, kind: str) -> DeviceTable | None:
@@ -102,6 +113,7 @@ class _File(_Section, frozen=True, kw_only=True):
     storage: StorageSection = StorageSection()
     sequencer: SequencerSection = SequencerSection()
     calibration: CalibrationSection = CalibrationSection()
+    hooks: HooksSection = HooksSection()
     camera: dict[str, Any] | None = None
     projector: dict[str, Any] | None = None
     stage: dict[str, Any] | None = None
@@ -152,6 +164,7 @@ def parse(text: str, origin: str) -> RigConfig:
         storage=file.storage,
         sequencer=file.sequencer,
         calibration=file.calibration,
+        hooks=file.hooks,
         devices=tuple(devices),
     )
 

@@ -44,8 +44,12 @@ _PROGRESS_S = 0.1
 _ROOM_S = 1.0
 _RATE_FRAMES = 20
 _RESULT_S = 30.0
+<<<<<<< HEAD
 TRUTH_S = 60.0
 _CONCLUDE_S = 600.0
+=======
+SUN_DEG_PER_HOUR = 15.0
+>>>>>>> occluder
 _STILL_S = 60.0
 """A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
 
@@ -88,6 +92,7 @@ class Course:
         self._timings: dict[str, float] = {}
         self._exposure_s = 0.0
         self._reason = ""  # why the steps ended
+        self._broke_off = ""  # when an interrupted run took its last frame
         self.beat = time.monotonic()
 
     # ------------------------------------------------------------ for others
@@ -174,7 +179,11 @@ class Course:
         began = time.monotonic()
         file = self.folder.file
         resuming = bool(file.started)
+<<<<<<< HEAD
         self._rig.require_ready()
+=======
+        self._broke_off = self._last_frame() if resuming else ""
+>>>>>>> occluder
         if resuming:
             self._same_devices(file.rig)
         settings = self._configure(session, file.spec, file.rig if resuming else None)
@@ -317,9 +326,39 @@ class Course:
         if not resuming:
             return 0, 0
         self._say("taking in what was recorded before the interruption")
+<<<<<<< HEAD
         step, sub = recorder.replay(lambda: self._replayed(session))
+=======
+        self._same_sun()
+        step, sub = recorder.replay()
+>>>>>>> occluder
         log.info("resumed", step=step, sub=sub, recorded=recorder.tally.recorded)
         return step, sub
+
+    def _last_frame(self) -> str:
+        """When the last frame was taken that is recorded, ISO 8601; "": there is none."""
+        if not (self.folder.path / "frames.jsonl").exists():
+            return ""
+        store = FrameStore.open(self.folder.path, readonly=True)
+        try:
+            return max((record.utc for record in store.records()), default="")
+        finally:
+            store.close()
+
+    def _same_sun(self) -> None:
+        """A scan under the sun is not resumed when the sun has gone on: shadows and shading with
+        it. Raises UmbraError(unsuitable)."""
+        spec, ended = self.folder.file.spec, self._broke_off
+        if not isinstance(spec, OccluderScan) or not spec.sun or not ended:
+            return
+        away_s = self._rig.clock.utc_ns() / NS - datetime.fromisoformat(ended).timestamp()
+        gone = away_s / 3600.0 * SUN_DEG_PER_HOUR
+        if gone > spec.drift_deg:
+            raise UmbraError(
+                Code.UNSUITABLE,
+                f"{self.folder.id} cannot be resumed: the sun has gone {gone:.1f} degrees since it "
+                f"broke off, and {spec.drift_deg:g} are allowed (--drift-deg); scan again",
+            )
 
     # ------------------------------------------------------------ during
 

@@ -135,6 +135,7 @@ class Recorder:
                 self._missing_patterns.add(record.observation.pattern)
                 continue
             scratch = self._frames.read(record.index, out=scratch)
+            self._method.recall(scratch, record.observation)
             self._estimator.update(scratch, record.observation)
             self._note(record)
             recorded += 1
@@ -272,6 +273,7 @@ class Recorder:
                 sub=exposed.sub,
                 incomplete=frame is None or frame.incomplete,
                 source=frame.source if frame else "",
+                pixels=frame.pixels if frame else None,
                 delay_us=(frame.start_ns - exposed.lit_ns) / 1e3 if frame and exposed.lit_ns else 0,
                 exposure_us=frame.exposure_us if frame else 0.0,
             ),

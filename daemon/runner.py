@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import structlog
 
+from daemon import aftermath
 from daemon.config import RigConfig
 from daemon.course import Course, utc_now
 from daemon.failures import as_error
@@ -173,6 +174,8 @@ class Runner:
         await ended
         thread.join()
         self._course = None
+        if not self._stopping:
+            await asyncio.to_thread(aftermath.after, run, self._store, self._config)
         self._publish(QueueChanged(queue=tuple(r.id for r in self._store.queued())))
         self._on_activity()
 

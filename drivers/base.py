@@ -420,6 +420,8 @@ class StageInfo:
     travel_mm: tuple[tuple[float, float], tuple[float, float]]  # (x min, x max), (y min, y max)
     max_feed_mm_s: float
     max_acceleration_mm_s2: float = 0.0
+    #: centre and radius of the only circle that it can go round (an eccentric); None: any
+    only_circle_mm: tuple[tuple[float, float], float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -303,7 +303,8 @@ class TmclStage(Stage):
         if not self._turn:
             raise DeviceLost(self.name, "info", "it is not connected", "reconnect it")
         (x, y), r = self.options.centre_mm, self.options.radius_mm
-        return StageInfo(((x - r, x + r), (y - r, y + r)), self.options.max_feed_mm_s)
+        travel = ((x - r, x + r), (y - r, y + r))
+        return StageInfo(travel, self.options.max_feed_mm_s, only_circle_mm=((x, y), r))
 
     def status(self) -> StageStatus:
         """See Stage."""

@@ -128,6 +128,13 @@ class OccluderScan(Scan, frozen=True, kw_only=True):
     time_limit_s: Annotated[Positive, Meta(description="seconds after which it ends anyway")] = (
         600.0
     )
+    sun: Annotated[
+        bool, Meta(description="the source drifts and clouds pass: follow its strength")
+    ] = False
+    drift_deg: Annotated[
+        Positive,
+        Meta(description="how far the sun may have gone when an interrupted scan is resumed"),
+    ] = 1.0
     #: None: all of the rig
     lights: Annotated[tuple[str, ...], Meta(description="sources to switch on, by name")] | None = (
         None

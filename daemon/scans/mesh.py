@@ -64,8 +64,11 @@ class MeshMethod(OccluderMethod[Mesh]):
         (x0, x1), (y0, y1) = stage.travel_mm
         centre = spec.centre_mm or ((x0 + x1) / 2.0, (y0 + y1) / 2.0)
         radius, feed = spec.radius_mm, spec.feed_mm_s
+        if stage.only_circle_mm is not None:
+            own, turned = stage.only_circle_mm
+            centre, radius = spec.centre_mm or own, radius or turned
         if self._mesh is not None:
-            radius, feed = self._planned(self._mesh, spec, bench)
+            radius, feed = self._planned(self._mesh, spec, bench, radius)
         if radius is None:
             raise Unsuitable(
                 "say the circle's radius (--radius-mm), or the mesh's holes and pitch (--hole-mm, "
@@ -82,7 +85,9 @@ class MeshMethod(OccluderMethod[Mesh]):
                 )
         return Circle(centre, radius, min(feed, stage.max_feed_mm_s))
 
-    def _planned(self, mesh: geometry.Mesh, spec: Mesh, bench: Bench) -> tuple[float, float]:
+    def _planned(
+        self, mesh: geometry.Mesh, spec: Mesh, bench: Bench, wanted_mm: float | None
+    ) -> tuple[float, float]:
         """Radius and feed: the spec's with warnings where the geometry says worse, else the best.
 
         Raises Unsuitable where no circle covers every point.
@@ -101,7 +106,7 @@ class MeshMethod(OccluderMethod[Mesh]):
             )
         except ValueError as error:
             raise Unsuitable(str(error), "$.pitch_mm") from error
-        radius = spec.radius_mm or best.circle.radius_mm
+        radius = wanted_mm or best.circle.radius_mm
         asked = geometry.circle(mesh, radius, penumbra)
         warnings = []
         for part, what in ((asked.lit, "in full light"), (asked.unlit, "in the umbra")):
@@ -131,6 +136,7 @@ class MeshMethod(OccluderMethod[Mesh]):
 
     def conclude(self, components: Components) -> Components:
         """See `Method`: with the warnings among the facts."""
+        components = super().conclude(components)
         if not self.warnings:
             return components
         return replace(components, facts={**components.facts, "warnings": list(self.warnings)})

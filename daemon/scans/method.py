@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
+from numpy.typing import NDArray
+
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation
 from drivers.base import CameraInfo, ProjectorInfo, StageInfo
 from protocol.patterns import AnyPattern
@@ -104,6 +106,7 @@ class Taken:
     sub: int
     incomplete: bool
     source: str = ""
+    pixels: NDArray[Any] | None = None  # of the frame, only to be read, within the call
     delay_us: float = 0.0  # see Observation
     exposure_us: float = 0.0
 
@@ -131,6 +134,10 @@ class Method(ABC, Generic[S]):
     @abstractmethod
     def observe(self, step: Step, taken: Taken) -> Observation:
         """Decide what a frame is used for. Called once a frame, in order; recorded."""
+
+    def recall(self, pixels: NDArray[Any], observation: Observation) -> None:
+        """See a frame again that was observed before an interruption; in order."""
+        del pixels, observation
 
     @abstractmethod
     def estimator(self) -> Estimator:

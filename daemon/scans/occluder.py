@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
-from typing import TypeVar
+from dataclasses import replace
+from typing import Any, TypeVar
+
+from numpy.typing import NDArray
 
 from daemon.scans.method import Bench, Expose, Method, Motion, Step, Taken, Unsuitable, Watch
 from daemon.scans.pattern_scan import REFERENCES, response_of
-from daemon.separation.estimator import Lighting, Observation
+from daemon.separation.estimator import Components, Lighting, Observation
+from daemon.separation.strength import SourceStrength
 from protocol.scans import OccluderScan, Reference
 
 O = TypeVar("O", bound=OccluderScan)  # noqa: E741
+
+MOST_CHANGE = 0.15
+"""Beyond this a change of the source is a cloud: below it, a scale."""
+
+LEAST_CHANGE = 0.005
+"""Within this the source has not changed."""
+
+INCOMPLETE = "incomplete frame"
 
 _LEAST_FRAMES = 2
 
@@ -40,6 +53,8 @@ class OccluderMethod(Method[O]):
             raise Unsuitable(
                 "nothing leaks into an umbra: leave the leakage away", "$.radiometry.leakage"
             )
+        self._source = SourceStrength(self.response) if spec.sun else None
+        self._rejected: Counter[str] = Counter()
         self._references = tuple(Expose(*REFERENCES[reference]) for reference in wanted)
         self._watch = Watch(
             self._frames(), motion if self._live else None, self._lights() if self._live else ()
@@ -86,12 +101,41 @@ class OccluderMethod(Method[O]):
         return self._watch if index == len(self._references) else None
 
     def observe(self, step: Step, taken: Taken) -> Observation:
-        """See `Method`."""
-        return Observation(
-            lighting=step.lighting if isinstance(step, Expose) else Lighting.PATTERN,
-            used=not taken.incomplete,
-            reason="incomplete frame" if taken.incomplete else "",
-        )
+        """See `Method`. Under the sun a small change of its strength is scaled; a frame under a
+        cloud is kept but not used, for sun and sky do not vary together."""
+        lighting = step.lighting if isinstance(step, Expose) else Lighting.PATTERN
+        if taken.incomplete or taken.pixels is None:
+            self._rejected[INCOMPLETE] += 1
+            return Observation(lighting=lighting, used=False, reason=INCOMPLETE)
+        if self._source is None or lighting is not Lighting.PATTERN:
+            return Observation(lighting=lighting)
+        strength = round(self._source.of(taken.pixels), 4)
+        if abs(strength - 1.0) > MOST_CHANGE:
+            why = "cloud" if strength < 1.0 else "brighter than when the scan began"
+            self._rejected[why] += 1
+            return Observation(used=False, reason=f"source at {strength:.0%}: {why}")
+        if abs(strength - 1.0) < LEAST_CHANGE or not self._source.learned:
+            strength = 1.0
+        self._source.accept(strength)
+        return Observation(strength=strength)
+
+    def recall(self, pixels: NDArray[Any], observation: Observation) -> None:
+        """See `Method`: the source's strength is followed on from where it was."""
+        if self._source is None or observation.lighting is not Lighting.PATTERN:
+            return
+        if not observation.used:
+            self._rejected[observation.reason.rpartition(": ")[2]] += 1
+        if observation.reason == INCOMPLETE:
+            return
+        self._source.of(pixels)
+        if observation.used:
+            self._source.accept(observation.strength)
+
+    def conclude(self, components: Components) -> Components:
+        """See `Method`: with the frames that were not used, by reason, among the facts."""
+        if not self._rejected:
+            return components
+        return replace(components, facts={**components.facts, "rejected": dict(self._rejected)})
 
     def enough(self, summary: Mapping[str, float], seconds: float) -> str:
         """See `Method`: covered, or out of time."""

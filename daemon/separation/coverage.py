@@ -69,13 +69,14 @@ class Occluder:
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Estimator`. Raises ValueError for an observation that cannot be respected."""
-        if observation.strength != 1.0 or observation.warp is not None:
-            raise ValueError("an occluder's extremes are taken as they are: no warp, strength 1")
+        if observation.warp is not None:
+            raise ValueError("an occluder's frames are compared where they are: no warp")
         if not observation.used:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
         else:
+            pixels = self._response.scaled(pixels, 1.0 / observation.strength)
             self._low.add(pixels)
             self._high.add(pixels)
             self._watch(pixels)
@@ -162,10 +163,22 @@ class Occluder:
         return twice | (once & _grown(cells.crossed, twice.shape))
 
     def summary(self) -> dict[str, float]:
-        """Frames, those not used, and the part of the picture that the shadow has crossed."""
+        """Frames, those not used, the part of the picture that the shadow has crossed, and the
+        coverage: the part crossed of what it would show on."""
         frames = self._low.frames
-        covered = float(self._cells(frames).crossed.mean()) if frames >= 2 else 0.0
-        return {"frames": float(frames), "unused": float(self._unused), "covered": covered}
+        covered = coverage = 0.0
+        if frames >= 2:
+            cells = self._cells(frames)
+            covered = float(cells.crossed.mean())
+            if covered > 0.0:
+                missed = float(cells.never().mean())
+                coverage = covered / (covered + missed)
+        return {
+            "frames": float(frames),
+            "unused": float(self._unused),
+            "covered": covered,
+            "coverage": coverage,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +194,22 @@ class _Cells:
     crossed: NDArray[np.bool_]
     least: float
 
+    def around(self) -> tuple[Plane, Plane]:
+        """What crossed cells around say of each cell: its light in shadow, and out of it."""
+        weight = np.where(self.crossed, self.fraction, np.float32(0)) ** 4
+        return _around(self.low, weight), _around(self.high, weight)
+
+    def never(self) -> NDArray[np.bool_]:
+        """Cells that the shadow never reached though it would show on them; some are crossed."""
+        unlit, lit = self.around()
+        fraction = np.divide(lit - unlit, np.maximum(lit, _TINY), dtype=np.float32)
+        between = (unlit + lit) * np.float32(0.5)
+        return np.asarray(
+            ~self.crossed
+            & (fraction * self.high > np.maximum(self.noisy, self.least * self.high))
+            & ~((self.high < between) & _enclosed(self.crossed))
+        )
+
 
 def _never_unlit(
     seen: NDArray[np.bool_], brightest: Plane, deviation: Plane, frames: int, cells: _Cells
@@ -188,18 +217,12 @@ def _never_unlit(
     """Pixels (H, W) that the shadow never reached, as far as the pixels around can tell."""
     if not cells.crossed.any():
         return np.ones_like(seen)
-    weight = np.where(cells.crossed, cells.fraction, np.float32(0)) ** 4
-    unlit_around, lit_around = _around(cells.low, weight), _around(cells.high, weight)
+    unlit_around, lit_around = cells.around()
     lost = lit_around - unlit_around
     fraction = np.divide(lost, np.maximum(lit_around, _TINY), dtype=np.float32)
     between: Plane = (unlit_around + lit_around) * np.float32(0.5)
     passed_by = _enclosed(cells.crossed)
-
-    cell_never = (
-        ~cells.crossed
-        & (fraction * cells.high > np.maximum(cells.noisy, cells.least * cells.high))
-        & ~((cells.high < between) & passed_by)
-    )
+    cell_never = cells.never()
     shape = seen.shape
     grey = _grey(brightest)
     expected = _smooth(fraction, shape) * grey
@@ -212,10 +235,16 @@ def _never_unlit(
 
 
 def _near_minimum(low: Plane, high: Plane, deviation: Plane) -> NDArray[np.uint16]:
-    """How many of the kept darkest samples lie near the darkest, in the channel with most."""
-    tolerance = np.maximum(np.float32(4.0) * deviation, np.float32(0.1) * (high[0] - low[0]))
-    near = np.count_nonzero(low - low[0] <= tolerance, axis=0)
-    return np.asarray(near if near.ndim == 2 else near.max(axis=2), dtype=np.uint16)
+    """How many of the kept darkest samples lie near the darkest: nearer than a tenth of the light
+    that the pixel lost, or than noise parts two samples. Of colours, their mean: a shadow takes all
+    of them, and noise less so."""
+    noise = _grey(deviation) * np.float32(1.0 if low.ndim == 3 else 3.0**-0.5)
+    darkest = _grey(low[0])
+    tolerance = np.maximum(
+        np.float32(2.0 * 2.0**0.5) * noise, np.float32(0.1) * (_grey(high[0]) - darkest)
+    )
+    near = [_grey(plane) - darkest <= tolerance for plane in low]
+    return np.asarray(np.count_nonzero(near, axis=0), dtype=np.uint16)
 
 
 def _cells(pixels: NDArray[Any]) -> Plane:

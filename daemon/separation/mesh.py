@@ -69,15 +69,15 @@ class MeshOccluder:
         self._share = 0.0
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """See `Estimator`. Raises ValueError for a frame that was not aligned and scaled."""
-        if observation.strength != 1.0 or observation.warp is not None:
-            raise ValueError("frames are aligned and scaled before they are compared")
+        """See `Estimator`. Raises ValueError for an observation that cannot be respected."""
+        if observation.warp is not None:
+            raise ValueError("an occluder's frames are compared where they are: no warp")
         if not observation.used:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
         else:
-            self._take(pixels)
+            self._take(self._response.scaled(pixels, 1.0 / observation.strength))
 
     def _take(self, pixels: NDArray[Any]) -> None:
         part = self._sampled(_SAMPLE)
@@ -253,7 +253,7 @@ class MeshOccluder:
         (square grid); the mean of rows and columns.
         """
         assert self._last is not None
-        rows = np.s_[:: _SAMPLE * 2]
+        rows = np.s_[::7]  # in no step with a pitch
         spacings = []
         noise = self._sensor()
         least = 1.0 if noise is None else 4 * SIGNIFICANT * noise.typical

@@ -81,6 +81,17 @@ class Response:
         table = self.table()
         return np.interp(light, table, np.arange(table.size)).astype(np.float32)
 
+    def scaled(self, counts: NDArray[Any], factor: float) -> NDArray[Any]:
+        """The counts of `factor` times the light: same shape and dtype. Saturated ones stay."""
+        if factor == 1.0:
+            return counts
+        every = np.arange(np.iinfo(counts.dtype).max + 1 if self.full_scale > 255 else 256)
+        light = self.linear(every.astype(counts.dtype)) * np.float32(factor)
+        table = np.clip(np.rint(self.counts(light)), 0, self.full_scale).astype(counts.dtype)
+        saturated = every >= self.saturated_from
+        table[saturated] = every[saturated]
+        return np.take(table, counts)
+
     def table(self) -> Plane:
         """Linear light of each count from 0 to full scale."""
         return _table(self.full_scale, self.black, self.tone)[: self.full_scale + 1]

@@ -155,3 +155,21 @@ def test_a_stick_is_swept_by_the_stage(daemon: Daemon) -> None:
         assert info.end.reason == "the stage's motion has come to its end"
         truth = run.result().facts["truth"]
         assert truth["rmse_direct"] < 0.06
+
+
+def test_a_scan_is_not_resumed_when_the_sun_has_gone_on(daemon: Daemon) -> None:
+    spec = umbra.Mesh(
+        hole_mm=12.5, pitch_mm=20.0, coverage=1.0, time_limit_s=600.0, sun=True, drift_deg=1e-4
+    )
+    bench = configured(daemon, scale=1)  # a clock that runs fast is ahead of the next daemon's
+    with bench.start() as rig:
+        run = rig.scan(spec).id
+        recorded(rig, run, 5)
+        bench.kill()
+    with bench.start() as rig:
+        rig.resume(run)
+        info = rig.run(run).wait(60, check=False)
+        assert info.state is RunState.FAILED
+        assert info.end is not None
+        assert info.end.code == "unsuitable"
+        assert "the sun has gone" in info.end.reason

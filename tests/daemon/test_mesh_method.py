@@ -1,0 +1,114 @@
+"""A mesh scan's plan from its spec and the rig: circle, feed, warnings, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from daemon.scans.catalog import method_for
+from daemon.scans.mesh import MeshMethod
+from daemon.scans.method import Bench, Circle, Sweep, Unsuitable, Watch
+from drivers.base import CameraInfo, PixelFormat, StageInfo
+from protocol import mesh as geometry
+from protocol.patterns import Axis
+from protocol.scans import Mesh, Radiometry, Reference, Stick
+
+STAGE = StageInfo(((0.0, 100.0), (0.0, 60.0)), 50.0)
+CAMERA = CameraInfo(64, 48, PixelFormat.MONO12)
+RIG = Bench(CAMERA, stage=STAGE, lights=("lamp",))
+KNOWN = Mesh(hole_mm=6.25, pitch_mm=10.0)
+
+
+def planned(spec: Mesh, bench: Bench = RIG) -> tuple[MeshMethod, Circle]:
+    method = method_for(spec, bench)
+    assert isinstance(method, MeshMethod)
+    step = method.step(len(spec.references or ()), {})
+    assert isinstance(step, Watch)
+    assert isinstance(step.motion, Circle)
+    assert step.lights == ("lamp",)
+    return method, step.motion
+
+
+def test_the_circle_is_the_best_one_in_the_middle_of_the_travel() -> None:
+    method, motion = planned(KNOWN)
+    best = geometry.best_circle(geometry.Mesh(6.25, 10.0))
+    assert motion.centre_mm == (50.0, 30.0)
+    assert motion.radius_mm == best.radius_mm
+    assert 0 < motion.feed_mm_s <= STAGE.max_feed_mm_s
+    assert method.warnings == ()
+    assert method.hole_fraction == pytest.approx(0.3068, abs=1e-4)
+    assert method.planned() is None  # coverage decides
+
+
+def test_a_request_that_does_worse_is_done_with_warnings() -> None:
+    method, motion = planned(replace_spec(KNOWN, radius_mm=4.0, feed_mm_s=45.0))
+    assert (motion.radius_mm, motion.feed_mm_s) == (4.0, 45.0)
+    assert "never in full light; 9 mm leaves none" in method.warnings[0]
+    assert "45 mm/s" in method.warnings[1]
+
+
+def test_an_eccentric_goes_round_its_own_circle() -> None:
+    eccentric = StageInfo(((-9, 9), (-9, 9)), 50.0, only_circle_mm=((0.0, 0.0), 9.0))
+    method, motion = planned(KNOWN, replace(RIG, stage=eccentric))
+    assert (motion.centre_mm, motion.radius_mm) == ((0.0, 0.0), 9.0)
+    assert method.warnings == ()
+    small = StageInfo(((-4, 4), (-4, 4)), 50.0, only_circle_mm=((0.0, 0.0), 4.0))
+    method, _ = planned(KNOWN, replace(RIG, stage=small))
+    assert "never in full light" in method.warnings[0]
+
+
+def test_it_ends_when_covered_or_out_of_time() -> None:
+    method, _ = planned(replace_spec(KNOWN, coverage=0.9, time_limit_s=60.0))
+    assert method.enough({"coverage": 0.5}, 10.0) == ""
+    assert method.enough({"coverage": 0.93}, 10.0).startswith("93.0% of the lit pixels")
+    assert method.enough({"coverage": 0.5}, 61.0).startswith("the time limit of 60 s, at 50.0%")
+
+
+@pytest.mark.parametrize(
+    ("spec", "bench", "said"),
+    [
+        (KNOWN, replace(RIG, stage=None), "needs a stage"),
+        (Mesh(), RIG, "hole fraction"),
+        (Mesh(hole_fraction=0.3), RIG, "circle's radius"),
+        (Mesh(hole_mm=5.0), RIG, "go together"),
+        (Mesh(hole_mm=12.0, pitch_mm=10.0), RIG, "run into each other"),
+        (Mesh(hole_fraction=0.3, radius_mm=40.0), RIG, "leaves the stage's travel"),
+        (Mesh(hole_mm=6.25, pitch_mm=10.0, scene_mm=900.0), RIG, "too wide"),
+        (Mesh(hole_mm=6.25, pitch_mm=10.0, lights=("sun",)), RIG, "no light 'sun', but lamp"),
+        (
+            Mesh(hole_mm=6.25, pitch_mm=10.0, references=(Reference.OPEN,)),
+            RIG,
+            "cannot take the mesh away",
+        ),
+        (
+            Mesh(hole_mm=6.25, pitch_mm=10.0, references=(Reference.BLACK,)),
+            RIG,
+            r"only ambient \(the source off\) and open",
+        ),
+        (
+            Mesh(hole_mm=6.25, pitch_mm=10.0, radiometry=Radiometry(leakage=0.1)),
+            RIG,
+            "leaks into an umbra",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(spec: Mesh, bench: Bench, said: str) -> None:
+    with pytest.raises(Unsuitable, match=said):
+        method_for(spec, bench)
+
+
+def test_a_stick_goes_to_and_fro_along_its_axis() -> None:
+    step = method_for(Stick(axis=Axis.Y, sweeps=2, sweep_mm=(10.0, 50.0)), RIG).step(0, {})
+    assert isinstance(step, Watch)
+    assert step.motion == Sweep(((50.0, 10.0), (50.0, 50.0), (50.0, 10.0)), 4.0)
+    with pytest.raises(Unsuitable, match="leaves the stage's travel"):
+        method_for(Stick(sweep_mm=(0.0, 200.0)), RIG)
+
+
+def replace_spec(spec: Mesh, **changes: Any) -> Mesh:
+    import msgspec
+
+    changed: Mesh = msgspec.structs.replace(spec, **changes)
+    return changed

@@ -1,0 +1,106 @@
+"""The source's strength is followed while a mesh's shadow moves, and is not fooled by it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.scans.catalog import method_for
+from daemon.scans.method import Bench, Taken, Watch
+from daemon.separation.estimator import Components, Observation
+from daemon.separation.radiometry import Response
+from daemon.separation.strength import SourceStrength
+from drivers.base import CameraInfo, PixelFormat, StageInfo
+from protocol.scans import Mesh
+from tests.daemon.test_mesh import COVERING, DEEP, HEIGHT, MESH, WIDTH, circle, counts, errors
+
+TURN = 72
+
+
+def sky(frame: int) -> float:
+    """Steady for a turn, a cloud, then a source that has sunk a little."""
+    if frame < TURN + 8:
+        return 1.0
+    if frame < TURN + 40:
+        return 0.6
+    return 0.95
+
+
+def frames(turns: int, *, steady: bool) -> list[NDArray[Any]]:
+    one = circle(COVERING, TURN, noise=200.0)
+    return [
+        counts(one[k % TURN].astype(np.float64) * (1.0 if steady else sky(k)))
+        for k in range(turns * TURN)
+    ]
+
+
+def test_strength_is_the_sources_and_not_the_shadows() -> None:
+    source = SourceStrength(DEEP)
+    seen = []
+    for k, frame in enumerate(frames(3, steady=False)):
+        strength = source.of(frame)
+        seen.append(strength)
+        if abs(strength - 1.0) < 0.15:
+            source.accept(strength if source.learned else 1.0)
+        assert strength == pytest.approx(sky(k), abs=0.03)
+    assert source.learned
+
+
+def observed(shots: list[NDArray[Any]]) -> tuple[Components, list[Observation]]:
+    camera = CameraInfo(WIDTH, HEIGHT, PixelFormat.MONO16)
+    bench = Bench(camera, stage=StageInfo(((0, 500), (0, 300)), 100.0))
+    method = method_for(Mesh(hole_mm=MESH.hole_mm, pitch_mm=MESH.pitch_mm, sun=True), bench)
+    step = method.step(0, {})
+    assert isinstance(step, Watch)
+    estimator, decided = method.estimator(), []
+    for k, frame in enumerate(shots):
+        observation = method.observe(step, Taken(0, k, incomplete=False, pixels=frame))
+        estimator.update(frame, observation)
+        decided.append(observation)
+    found = estimator.result()
+    assert isinstance(found, Components)
+    return method.conclude(found), decided
+
+
+def test_a_cloud_is_kept_out_and_drift_is_scaled_so_that_the_separation_is_the_same() -> None:
+    clear, _ = observed(frames(3, steady=True))
+    cloudy, decided = observed(frames(3, steady=False))
+    assert cloudy.facts["rejected"] == {"cloud": 32}
+    assert clear.facts.get("rejected") is None
+    assert "source at 60%" in decided[TURN + 20].reason
+    assert decided[-1].used
+    assert decided[-1].strength == pytest.approx(0.95, abs=0.02)
+    for one, other in zip(errors(clear), errors(cloudy), strict=True):
+        assert other < 1.3 * one + 100.0  # 100 of 65535
+
+
+def test_what_was_observed_is_followed_on_after_an_interruption() -> None:
+    shots = frames(2, steady=False)
+    whole, decided = observed(shots)
+    camera = CameraInfo(WIDTH, HEIGHT, PixelFormat.MONO16)
+    bench = Bench(camera, stage=StageInfo(((0, 500), (0, 300)), 100.0))
+    method = method_for(Mesh(hole_mm=MESH.hole_mm, pitch_mm=MESH.pitch_mm, sun=True), bench)
+    step = method.step(0, {})
+    assert step is not None
+    for frame, observation in zip(shots[:100], decided[:100], strict=True):
+        method.recall(frame, observation)
+    later = [
+        method.observe(step, Taken(0, k, incomplete=False, pixels=shots[k]))
+        for k in range(100, len(shots))
+    ]
+    assert later == decided[100:]
+    assert method.conclude(whole).facts["rejected"] == whole.facts["rejected"]
+
+
+@pytest.mark.parametrize("tone", ["linear", "srgb"])
+def test_scaling_counts_scales_light(tone: str) -> None:
+    response = Response(full_scale=4095, black=64.0, tone=tone)
+    before = np.arange(200, 3000, 7, dtype=np.uint16)
+    after = response.scaled(before, 1.25)
+    np.testing.assert_allclose(
+        response.linear(after), 1.25 * response.linear(before), rtol=0.01, atol=2
+    )
+    assert response.scaled(np.array([4095], np.uint16), 0.5) == 4095  # saturated stays so
