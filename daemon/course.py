@@ -44,12 +44,9 @@ _PROGRESS_S = 0.1
 _ROOM_S = 1.0
 _RATE_FRAMES = 20
 _RESULT_S = 30.0
-<<<<<<< HEAD
 TRUTH_S = 60.0
 _CONCLUDE_S = 600.0
-=======
 SUN_DEG_PER_HOUR = 15.0
->>>>>>> occluder
 _STILL_S = 60.0
 """A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
 
@@ -179,11 +176,8 @@ class Course:
         began = time.monotonic()
         file = self.folder.file
         resuming = bool(file.started)
-<<<<<<< HEAD
         self._rig.require_ready()
-=======
         self._broke_off = self._last_frame() if resuming else ""
->>>>>>> occluder
         if resuming:
             self._same_devices(file.rig)
         settings = self._configure(session, file.spec, file.rig if resuming else None)
@@ -326,12 +320,8 @@ class Course:
         if not resuming:
             return 0, 0
         self._say("taking in what was recorded before the interruption")
-<<<<<<< HEAD
-        step, sub = recorder.replay(lambda: self._replayed(session))
-=======
         self._same_sun()
-        step, sub = recorder.replay()
->>>>>>> occluder
+        step, sub = recorder.replay(lambda: self._replayed(session))
         log.info("resumed", step=step, sub=sub, recorded=recorder.tally.recorded)
         return step, sub
 

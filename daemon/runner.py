@@ -175,7 +175,7 @@ class Runner:
         thread.join()
         self._course = None
         if not self._stopping:
-            await asyncio.to_thread(aftermath.after, run, self._store, self._config)
+            await asyncio.to_thread(aftermath.after, course.folder, self._store, self._config)
         self._publish(QueueChanged(queue=tuple(r.id for r in self._store.queued())))
         self._on_activity()
 

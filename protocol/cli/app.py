@@ -25,10 +25,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "calibrate": ("scan:calibrate", "Calibrate the rig: dark, noise, leak, tone, latency."),
         "verify": ("scan:verify", "Verify the separation at points, as the paper does (3.5)."),
         "plan": ("plan:app", "Work out radius, feed and frames of a mesh scan; no rig needed."),
-<<<<<<< HEAD
         "advise": ("scan:advise", "Which pattern, images and exposure this scene needs."),
-=======
->>>>>>> occluder
         "watch": ("watch:watch", "Follow a run: progress, rate, time left."),
         "runs": ("runs:runs", "List runs, the newest first."),
         "run": ("runs:run", "One run in detail."),
