@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict
@@ -30,6 +31,9 @@ from protocol import messages as m
 from protocol.errors import Code, UmbraError
 
 T = TypeVar("T")
+
+ESTOP = "estop"
+"""An emergency stop: the reason to hold the queue, and its mark in the data folder."""
 
 
 class Commands:
@@ -60,7 +64,11 @@ class Commands:
         self._book = book
         self._epoch = epoch
         self._began = time.monotonic()
-        self._estopped = False
+        self._estopped = store.marked(ESTOP)
+        if self._estopped:
+            rig.latch()
+            runner.hold(ESTOP)
+        self._results = asyncio.Semaphore(1)  # one at a time: each takes the estimator's thread
         self.stopping = False
         self._table: dict[type[m.Command], Callable[[Any, _Asked], Awaitable[Answer]]] = {
             m.Hello: self._hello,
@@ -107,6 +115,11 @@ class Commands:
         if self.stopping and command.role is m.Role.OPERATOR:
             raise UmbraError(Code.STOPPING, "umbrad is shutting down; ask again when it is back")
         return await self._table[type(command)](command, _Asked(caller, request_id, token))
+
+    def stop(self, reason: str) -> None:
+        """From now on nothing is begun any more."""
+        self.stopping = True
+        self.changed(reason)
 
     @property
     def state(self) -> m.RigState:
@@ -183,6 +196,8 @@ class Commands:
     # ------------------------------------------------------------ runs
 
     async def _submit(self, command: m.Submit, asked: _Asked) -> Answer:
+        if (known := self._runner.submitted(asked.request_id)) is not None:
+            return _about(known)
         self._manual.admit(asked.token)
         if self._estopped:
             raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
@@ -216,14 +231,20 @@ class Commands:
 
     async def _abort(self, command: m.Abort, asked: _Asked) -> Answer:
         by = command.by or asked.caller.name
-        return _about(await asyncio.to_thread(self._runner.abort, command.run, by))
+        # Here and not in a worker: what waits for the workers must not delay it.
+        current = self._runner.abort_current(command.run, by)
+        if current is None:
+            current = await asyncio.to_thread(self._runner.abort, command.run, by)
+        return _about(current)
 
     async def _estop(self, command: m.EStop, asked: _Asked) -> Answer:
         by = command.by or asked.caller.name
         self._estopped = True
-        self._runner.hold("estop")
-        futures = self._rig.make_safe()
+        self._runner.hold(ESTOP)
+        self._rig.latch()
         self._runner.end_for_estop(by)
+        futures = self._rig.make_safe()
+        await asyncio.to_thread(self._store.mark, ESTOP)  # a restart must not light anything
         safe = await asyncio.to_thread(self._rig.safe_within, futures, SAFE_S)
         self.changed(f"emergency stop{f' by {by}' if by else ''}")
         if not safe:
@@ -234,19 +255,18 @@ class Commands:
 
     async def _reset(self, _: m.Reset, __: _Asked) -> Answer:
         await asyncio.to_thread(self._rig.require_ready)
+        await asyncio.to_thread(self._store.unmark, ESTOP)
+        self._rig.unlatch()
         self._estopped = False
-        self._runner.release("estop")
+        self._runner.release(ESTOP)
         self.changed("reset")
         return Answer(m.Done(message="the queue goes on"))
 
     async def _runs(self, command: m.ListRuns, _: _Asked) -> Answer:
         def listed() -> tuple[m.RunInfo, ...]:
-            chosen = [
-                run.info()
-                for run in self._store.runs()
-                if command.state is None or run.file.state is command.state
-            ]
-            return tuple(chosen[: command.limit])
+            runs = self._store.runs()
+            chosen = (r for r in runs if command.state is None or r.file.state is command.state)
+            return tuple(run.info() for run in itertools.islice(chosen, command.limit))
 
         return Answer(m.Runs(runs=await asyncio.to_thread(listed)))
 
@@ -265,7 +285,8 @@ class Commands:
                 {"direct": found.direct, "global": found.global_, "quality": found.quality},
             )
 
-        return await asyncio.to_thread(result)
+        async with self._results:
+            return await asyncio.to_thread(result)
 
     def _result_of(self, run: RunFolder) -> tuple[Result, dict[str, Any]]:
         """Of a run under way: so far; of one that has ended: as its products have it."""

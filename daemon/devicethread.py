@@ -156,7 +156,7 @@ class DeviceThread(Generic[D]):
                 task.future.set_result(task.act(self.device))
             except (DeviceError, Revoked) as error:
                 task.future.set_exception(error)
-            except BaseException as error:  # whatever a vendor's library raises
+            except BaseException as error:
                 log.exception("a driver broke", device=self.device.name)
                 task.future.set_exception(_broken(self.device.name, error))
             finally:

@@ -137,6 +137,10 @@ class Manual:
         """Call now and then: end what nobody renewed. Never blocks."""
         now = time.monotonic()
         with self._mutex:
+            if self._session is not None and self._session.ended.is_set():
+                self._rig.leave(self._session)  # an emergency stop took it
+                self._session = None
+                self._on_change()
             if self._lock is not None and now >= self._lock.until:
                 log.warning("lock lost its heartbeat: safe state", owner=self._lock.owner)
                 self._lock = None

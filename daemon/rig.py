@@ -150,6 +150,12 @@ class Rig:
             calibration=calibration,
         )
 
+    @property
+    def ready(self) -> bool:
+        """Whether there is a camera, and every device is ready."""
+        members = self._members.values()
+        return self._only("camera") is not None and all(m.health is Health.READY for m in members)
+
     def require_ready(self) -> None:
         """Raise UmbraError(device_lost) naming the first device that is not ready."""
         self._need("camera")

@@ -26,7 +26,7 @@ from daemon.separation.estimator import (
     Plot,
 )
 from daemon.separation.radiometry import Plane, Response
-from daemon.separation.sampling import Mask, Moments, bright
+from daemon.separation.sampling import Mask, Moments, Turns, bright
 
 _RESOLVED = 0.95  # of the largest size's contrast: a size that has it tells pixel from pixel
 _PEAK = 0.85  # of full scale: where the brightest part of the scene should be
@@ -67,6 +67,7 @@ class Advice:
         self._ends = np.cumsum(images)
         self._situation = situation
         self._references = {kind: Moments() for kind in Lighting}
+        self._turns = Turns()
         self._contrast = CheckerContrast(response)
         self._saturated: Mask | None = None
         self._planes: list[Plane] = []
@@ -82,13 +83,18 @@ class Advice:
                     known = self._saturated
                     self._saturated = saturated if known is None else known | saturated
             return
+        if (overdue := self._turns.overdue(observation)) is not None:
+            self._end(overdue)
         if observation.used:
             self._contrast.add(pixels)
         if observation.last:
-            self._contrast.end_of_pattern()
-            if observation.pattern + 1 in self._ends:
-                self._planes.append(self._contrast.take())
-                self._sign = self._contrast.sign
+            self._end(observation.pattern)
+
+    def _end(self, pattern: int) -> None:
+        self._contrast.end_of_pattern()
+        if pattern + 1 in self._ends:
+            self._planes.append(self._contrast.take())
+            self._sign = self._contrast.sign
 
     # ------------------------------------------------------------ results
 

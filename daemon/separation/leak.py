@@ -17,7 +17,7 @@ from daemon.separation.estimator import (
     Plot,
 )
 from daemon.separation.radiometry import FrameMean, Plane, Response
-from daemon.separation.sampling import Mask, bright, median_ratio, ratio
+from daemon.separation.sampling import Mask, Turns, bright, median_ratio, ratio
 
 _RESOLVED = 0.5
 """A size whose contrast is less than this part of the largest's is not resolved."""
@@ -46,6 +46,7 @@ class Leak:
         self._sizes = sizes
         self._ends = np.cumsum(images)
         self._references = {kind: FrameMean(response) for kind in Lighting}
+        self._turns = Turns()
         self._pairs = CheckerContrast(response)
         self._saturated: Mask | None = None
         self._good: Mask | None = None
@@ -62,13 +63,18 @@ class Leak:
                     known = self._saturated
                     self._saturated = saturated if known is None else known | saturated
             return
+        if (overdue := self._turns.overdue(observation)) is not None:
+            self._end(overdue)
         if observation.used:
             self._pairs.add(pixels)
         if observation.last:
-            self._pairs.end_of_pattern()
-            if observation.pattern + 1 in self._ends:
-                number = int(np.searchsorted(self._ends, observation.pattern, side="right"))
-                self._close(number, self._pairs.take())
+            self._end(observation.pattern)
+
+    def _end(self, pattern: int) -> None:
+        self._pairs.end_of_pattern()
+        if pattern + 1 in self._ends:
+            number = int(np.searchsorted(self._ends, pattern, side="right"))
+            self._close(number, self._pairs.take())
 
     def _close(self, number: int, contrast: Plane) -> None:
         if self._largest is None:
