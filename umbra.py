@@ -5,6 +5,7 @@ from protocol.client import Client, connect
 from protocol.errors import Code, UmbraError
 from protocol.patterns import BLACK, WHITE, Checker, Solid
 from protocol.scans import (
+    Advise,
     CalibrateDark,
     CalibrateLatency,
     CalibrateLeak,
@@ -31,6 +32,7 @@ from protocol.scans import (
 __all__ = [
     "BLACK",
     "WHITE",
+    "Advise",
     "AsyncClient",
     "CalibrateDark",
     "CalibrateLatency",

@@ -15,6 +15,7 @@ import os
 import secrets
 import signal
 import sys
+import threading
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ from daemon.server import Server
 from daemon.store import Store
 from daemon.viewfinder import Glimpse, Viewfinder
 from protocol.errors import UmbraError
-from protocol.messages import AnyEvent, DeviceChanged, PreviewTaken
+from protocol.messages import AnyEvent, DeviceChanged, DeviceInfo, PreviewTaken
 
 _TEND_S = 1.0
 _SWITCH_S = 0.0005
@@ -80,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 class StartError(Exception):
-    """umbrad cannot start; the message is one line."""
+    """umbrad cannot start or go on; the message is one line."""
 
 
 class _Daemon:
@@ -93,13 +94,13 @@ class _Daemon:
         self._notifier = Notifier()
         self._stop = asyncio.Event()
         self._reason = ""
+        self._broken = False
         self._tasks: list[asyncio.Task[None]] = []
 
     async def run(self, *, until_eof: bool) -> None:
         """Start, serve until asked to stop, stop. Raises UmbraError, ConfigError."""
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self._ask_to_stop, number.name)
+        self._heed_signals(loop)
         epoch = secrets.token_hex(6)
         with contextlib.ExitStack() as stack:
             store = stack.enter_context(
@@ -118,13 +119,18 @@ class _Daemon:
                 loop.call_soon_threadsafe(publisher.publish, body)
 
             def glimpsed(glimpse: Glimpse) -> None:
-                body = PreviewTaken(run=glimpse.run, what="frame", facts=glimpse.facts)
-                loop.call_soon_threadsafe(lambda: publisher.publish(body, preview=glimpse.picture))
+                body = PreviewTaken(run=glimpse.run, what=glimpse.what, facts=glimpse.facts)
+                arrays = {"preview": glimpse.picture, "saturated": glimpse.saturated}
+                loop.call_soon_threadsafe(lambda: publisher.publish(body, **arrays))
 
             def changed() -> None:
                 loop.call_soon_threadsafe(commands.changed)
 
-            rig = Rig(self._config, lambda info: publish(DeviceChanged(device=info)))
+            def health(info: DeviceInfo) -> None:
+                publish(DeviceChanged(device=info))
+                runner.wake()  # runs wait for devices that are away
+
+            rig = Rig(self._config, health)
             viewfinder = Viewfinder(glimpsed)
             manual = Manual(rig, viewfinder, changed, publish)
             runner = Runner(
@@ -156,36 +162,48 @@ class _Daemon:
                 epoch=epoch,
             )
             runner.recover()
-            await asyncio.to_thread(rig.connect)
-            server = Server(commands_socket, commands.handle, access.caller)
-            self._serve(server.serve())
-            self._serve(runner.serve())
-            self._serve(self._tend(rig, manual, runner))
-            if (interval := self._notifier.watchdog_interval()) is not None:
-                self._serve(self._watch(interval, rig, runner))
-            if until_eof:
-                self._until_eof(loop)
-            self._notifier.ready(self._status_line(runner))
-            log.info(
-                "ready",
-                rig=self._config.rig.name,
-                version=__version__,
-                command=self._config.network.command,
-                events=self._config.network.events,
-                data=self._config.rig.data,
-            )
-            await self._stop.wait()
-            log.info("stopping", reason=self._reason)
-            self._notifier.stopping()
-            commands.stopping = True
-            commands.changed(self._reason)
-            await self._shut_down(rig, runner)
+            running = None
+            try:
+                await asyncio.to_thread(rig.connect)
+                self._serve(Server(commands_socket, commands.handle, access.caller).serve())
+                running = self._serve(runner.serve())
+                self._serve(self._tend(rig, manual, runner))
+                self._serve(self._watch(rig, runner))
+                if until_eof:
+                    self._until_eof(loop)
+                self._notifier.ready(self._status_line(runner))
+                self._log_ready()
+                await self._stop.wait()
+            finally:  # whatever ends the daemon, the devices end in their safe state
+                commands.stop(self._reason)
+                await self._shut_down(rig, runner, running)
         log.info("stopped")
+        if self._broken:
+            raise StartError(f"{self._reason}; the log has the details")
 
-    async def _shut_down(self, rig: Rig, runner: Runner) -> None:
-        await runner.stop()
-        serving = self._tasks[1]
-        await asyncio.wait([serving])
+    def _heed_signals(self, loop: asyncio.AbstractEventLoop) -> None:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._ask_to_stop, number.name)
+
+    def _log_ready(self) -> None:
+        network = self._config.network
+        log.info(
+            "ready",
+            rig=self._config.rig.name,
+            version=__version__,
+            command=network.command,
+            events=network.events,
+            data=self._config.rig.data,
+        )
+
+    async def _shut_down(
+        self, rig: Rig, runner: Runner, running: asyncio.Task[None] | None
+    ) -> None:
+        log.info("stopping", reason=self._reason)
+        self._notifier.stopping()
+        runner.stop()
+        if running is not None:
+            await asyncio.wait([running])
         await asyncio.to_thread(rig.close)
         for task in self._tasks:
             task.cancel()
@@ -211,23 +229,26 @@ class _Daemon:
             ) from error
         return socket
 
-    def _serve(self, work: Coroutine[Any, Any, None]) -> None:
+    def _serve(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """A task that must not end by itself: if it breaks, the daemon stops."""
         task = asyncio.create_task(work)
 
         def ended(done: asyncio.Task[None]) -> None:
             if not done.cancelled() and done.exception() is not None:
                 log.error("a part of umbrad broke", exc_info=done.exception())
+                self._broken = True
                 self._ask_to_stop("a part of umbrad broke")
 
         task.add_done_callback(ended)
         self._tasks.append(task)
+        return task
 
     async def _tend(self, rig: Rig, manual: Manual, runner: Runner) -> None:
         told = ""
         while True:
             rig.tend()
             manual.tend()
+            await asyncio.to_thread(runner.tend)
             if manual.lock_info() is None:
                 runner.release(LOCK)
             status = self._status_line(runner)
@@ -236,9 +257,10 @@ class _Daemon:
                 self._notifier.status(status)
             await asyncio.sleep(_TEND_S)
 
-    async def _watch(self, interval: float, rig: Rig, runner: Runner) -> None:
+    async def _watch(self, rig: Rig, runner: Runner) -> None:
         """WATCHDOG=1 only while the loop (it is here) and every thread have beaten lately."""
-        while True:
+        interval = self._notifier.watchdog_interval()
+        while interval is not None:
             if not rig.alive:
                 log.error("no watchdog beat: a device thread is stuck")
             elif not runner.alive:
@@ -250,7 +272,10 @@ class _Daemon:
     def _status_line(self, runner: Runner) -> str:
         progress = runner.progress
         if progress is None:
-            return f"idle, {len(runner.queue())} queued"
+            waits_for = runner.waits_for
+            return f"idle, {len(runner.queue())} queued" + (
+                f", waiting for: {waits_for}" if waits_for else ""
+            )
         share = "" if progress.fraction is None else f" {progress.fraction:.0%}"
         return f"{progress.run}: {progress.phase}{share}"
 
@@ -259,12 +284,14 @@ class _Daemon:
         self._stop.set()
 
     def _until_eof(self, loop: asyncio.AbstractEventLoop) -> None:
-        def readable() -> None:
-            if not os.read(sys.stdin.fileno(), 4096):
-                loop.remove_reader(sys.stdin)
-                self._ask_to_stop("standard input was closed")
+        def read() -> None:
+            with contextlib.suppress(OSError):
+                while os.read(sys.stdin.fileno(), 4096):
+                    pass
+            loop.call_soon_threadsafe(self._ask_to_stop, "standard input was closed")
 
-        loop.add_reader(sys.stdin, readable)
+        # A thread, for standard input may be a file or a device that cannot be waited for.
+        threading.Thread(target=read, name="umbra-stdin", daemon=True).start()
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict
@@ -11,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from daemon import __version__, discovery, measured, picture, products
+from daemon.calibration import Calibrations
 from daemon.config import RigConfig
 from daemon.doctor.examination import Doctor
 from daemon.logs import LogBook
@@ -22,13 +24,16 @@ from daemon.scans import catalog
 from daemon.separation.estimator import Components, Result
 from daemon.server import Answer, Caller
 from daemon.store import RunFolder, Store
-from daemon.viewfinder import Viewfinder, facts_of
+from daemon.viewfinder import Glimpse, Viewfinder, cells, facts_of
 from drivers.base import CameraSettings as DriverSettings
 from drivers.base import PixelFormat
 from protocol import messages as m
 from protocol.errors import Code, UmbraError
 
 T = TypeVar("T")
+
+ESTOP = "estop"
+"""An emergency stop: the reason to hold the queue, and its mark in the data folder."""
 
 
 class Commands:
@@ -59,7 +64,11 @@ class Commands:
         self._book = book
         self._epoch = epoch
         self._began = time.monotonic()
-        self._estopped = False
+        self._estopped = store.marked(ESTOP)
+        if self._estopped:
+            rig.latch()
+            runner.hold(ESTOP)
+        self._results = asyncio.Semaphore(1)  # one at a time: each takes the estimator's thread
         self.stopping = False
         self._table: dict[type[m.Command], Callable[[Any, _Asked], Awaitable[Answer]]] = {
             m.Hello: self._hello,
@@ -81,6 +90,8 @@ class Commands:
             m.GetProduct: self._product,
             m.GetLog: self._log,
             m.GetPreview: self._preview,
+            m.StartLive: self._start_live,
+            m.StopLive: self._stop_live,
             m.Show: self._show,
             m.Snap: self._snap,
             m.SetCamera: self._camera,
@@ -104,6 +115,11 @@ class Commands:
         if self.stopping and command.role is m.Role.OPERATOR:
             raise UmbraError(Code.STOPPING, "umbrad is shutting down; ask again when it is back")
         return await self._table[type(command)](command, _Asked(caller, request_id, token))
+
+    def stop(self, reason: str) -> None:
+        """From now on nothing is begun any more."""
+        self.stopping = True
+        self.changed(reason)
 
     @property
     def state(self) -> m.RigState:
@@ -173,11 +189,15 @@ class Commands:
         return Answer(m.Examined(checks=tuple(checks)))
 
     async def _log(self, command: m.GetLog, _: _Asked) -> Answer:
+        if command.run:
+            await asyncio.to_thread(self._store.open, command.run)  # a name that is wrong is said
         return Answer(m.Log(records=self._book.records(command.run, command.limit)))
 
     # ------------------------------------------------------------ runs
 
     async def _submit(self, command: m.Submit, asked: _Asked) -> Answer:
+        if (known := self._runner.submitted(asked.request_id)) is not None:
+            return _about(known)
         self._manual.admit(asked.token)
         if self._estopped:
             raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
@@ -211,14 +231,20 @@ class Commands:
 
     async def _abort(self, command: m.Abort, asked: _Asked) -> Answer:
         by = command.by or asked.caller.name
-        return _about(await asyncio.to_thread(self._runner.abort, command.run, by))
+        # Here and not in a worker: what waits for the workers must not delay it.
+        current = self._runner.abort_current(command.run, by)
+        if current is None:
+            current = await asyncio.to_thread(self._runner.abort, command.run, by)
+        return _about(current)
 
     async def _estop(self, command: m.EStop, asked: _Asked) -> Answer:
         by = command.by or asked.caller.name
         self._estopped = True
-        self._runner.hold("estop")
-        futures = self._rig.make_safe()
+        self._runner.hold(ESTOP)
+        self._rig.latch()
         self._runner.end_for_estop(by)
+        futures = self._rig.make_safe()
+        await asyncio.to_thread(self._store.mark, ESTOP)  # a restart must not light anything
         safe = await asyncio.to_thread(self._rig.safe_within, futures, SAFE_S)
         self.changed(f"emergency stop{f' by {by}' if by else ''}")
         if not safe:
@@ -229,19 +255,18 @@ class Commands:
 
     async def _reset(self, _: m.Reset, __: _Asked) -> Answer:
         await asyncio.to_thread(self._rig.require_ready)
+        await asyncio.to_thread(self._store.unmark, ESTOP)
+        self._rig.unlatch()
         self._estopped = False
-        self._runner.release("estop")
+        self._runner.release(ESTOP)
         self.changed("reset")
         return Answer(m.Done(message="the queue goes on"))
 
     async def _runs(self, command: m.ListRuns, _: _Asked) -> Answer:
         def listed() -> tuple[m.RunInfo, ...]:
-            chosen = [
-                run.info()
-                for run in self._store.runs()
-                if command.state is None or run.file.state is command.state
-            ]
-            return tuple(chosen[: command.limit])
+            runs = self._store.runs()
+            chosen = (r for r in runs if command.state is None or r.file.state is command.state)
+            return tuple(run.info() for run in itertools.islice(chosen, command.limit))
 
         return Answer(m.Runs(runs=await asyncio.to_thread(listed)))
 
@@ -260,7 +285,8 @@ class Commands:
                 {"direct": found.direct, "global": found.global_, "quality": found.quality},
             )
 
-        return await asyncio.to_thread(result)
+        async with self._results:
+            return await asyncio.to_thread(result)
 
     def _result_of(self, run: RunFolder) -> tuple[Result, dict[str, Any]]:
         """Of a run under way: so far; of one that has ended: as its products have it."""
@@ -294,10 +320,9 @@ class Commands:
                     raise UmbraError(
                         Code.NO_RESULT, "no frame has been taken yet; `umbra snap` takes one"
                     )
-                small = picture.narrowed(glimpse.picture, command.width)
-                return Answer(
-                    m.Picture(facts={**glimpse.facts, "run": glimpse.run}), {"preview": small}
-                )
+                return _looked(glimpse, command.width)
+            if self._manual.live.separating and (seen := self._viewfinder.latest(command.what)):
+                return _looked(seen, command.width)
             run = self._runner.find("")
             components, _ = self._result_of(run)
             if not isinstance(components, Components):
@@ -332,6 +357,33 @@ class Commands:
                 Code.BUSY,
                 f"{current.id} is using the devices; wait for it, or `umbra abort`",
             )
+
+    async def _start_live(self, command: m.StartLive, asked: _Asked) -> Answer:
+        def look() -> None:
+            bench = None
+            if command.separate is not None:
+                bench = self._rig.bench(self._calibration())
+            self._manual.look(command.rate_hz, command.lease_s, command.separate, bench)
+
+        await self._by_hand(asked, look)
+        return Answer(m.Done(message=f"live for {command.lease_s:g} s, unless asked again"))
+
+    def _calibration(self) -> dict[str, Any]:
+        """The values that apply to the rig as it is now."""
+        camera = self._rig.camera.device
+        in_force = camera.settings()
+        settings = {
+            "exposure_us": in_force.exposure_us,
+            "gain": in_force.gain,
+            "pixel_format": camera.info().pixel_format.value,
+        }
+        found = Calibrations(self._store, self._config.calibration.max_age_days)
+        values: dict[str, Any] = found.of(self._rig.snapshot(), settings)["values"]
+        return values
+
+    async def _stop_live(self, _: m.StopLive, __: _Asked) -> Answer:
+        await asyncio.to_thread(self._manual.live.stop)
+        return Answer(m.Done(message="the live view has ended"))
 
     async def _show(self, command: m.Show, asked: _Asked) -> Answer:
         await self._by_hand(asked, lambda: self._manual.show(command.pattern, command.lease_s))
@@ -428,6 +480,12 @@ class _Asked:
         self.caller = caller
         self.request_id = request_id
         self.token = token
+
+
+def _looked(glimpse: Glimpse, width: int) -> Answer:
+    small = picture.narrowed(glimpse.picture, width)
+    arrays = {"preview": small, "saturated": cells(glimpse.saturated, *small.shape[:2])}
+    return Answer(m.Picture(facts={**glimpse.facts, "run": glimpse.run}), arrays)
 
 
 def _about(run: RunFolder) -> Answer:

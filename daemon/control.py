@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from daemon.devicethread import Session
+from daemon.devicethread import Revoked, Session
 from protocol.messages import End, RunState
 
 
@@ -54,11 +54,17 @@ class Control:
 
         `on_pause` is called once, with the reason, before the wait.
         """
-        session.check()
+        self.check(session)
         if self._go.is_set():
             return False
         on_pause(self._reason)
         while not self._go.wait(0.25):
             session.check()
-        session.check()
+        self.check(session)
         return True
+
+    def check(self, session: Session) -> None:
+        """Raise Revoked when the run must end, also before its session has been revoked."""
+        if self._end is not None:
+            raise Revoked(session.owner)
+        session.check()

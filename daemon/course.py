@@ -11,10 +11,11 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import Any
 
+import msgspec
 import structlog
 
 from daemon import products
@@ -43,6 +44,8 @@ _PROGRESS_S = 0.1
 _ROOM_S = 1.0
 _RATE_FRAMES = 20
 _RESULT_S = 30.0
+TRUTH_S = 60.0
+_CONCLUDE_S = 600.0
 SUN_DEG_PER_HOUR = 15.0
 _STILL_S = 60.0
 """A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
@@ -126,9 +129,10 @@ class Course:
 
     @property
     def alive(self) -> bool:
-        """Whether it has moved lately; a pause, and the making of products, count as moving."""
-        at_rest = self.control.paused or self.folder.file.state is not RunState.RUNNING
-        return at_rest or time.monotonic() - self.beat < _STILL_S + 2 * self._exposure_s
+        """Whether it has moved lately. In a pause there is nothing to move."""
+        state = self.folder.file.state
+        limit = _CONCLUDE_S if state is RunState.FINISHING else _STILL_S + 2 * self._exposure_s
+        return state is RunState.PAUSED or time.monotonic() - self.beat < limit
 
     def _rate(self) -> float:
         moments = list(self._moments)
@@ -144,6 +148,7 @@ class Course:
         session: Session | None = None
         try:
             session = self._rig.take(f"run {self.folder.id}")
+            self.control.check(session)  # what came before there was a session to revoke
             end = self._execute(session)
         except Revoked:
             end = self.control.verdict or End(
@@ -171,6 +176,7 @@ class Course:
         began = time.monotonic()
         file = self.folder.file
         resuming = bool(file.started)
+        self._rig.require_ready()
         self._broke_off = self._last_frame() if resuming else ""
         if resuming:
             self._same_devices(file.rig)
@@ -196,7 +202,7 @@ class Course:
         try:
             ring = Ring(self._config.sequencer.ring_frames, info.shape, info.pixel_format.dtype)
             recorder = self._recorder = Recorder(method, frames, ring, self._taken)
-            step, sub = self._replay(recorder, resuming)
+            step, sub = self._replay(session, recorder, resuming)
             recorder.start()
             self._say("scanning")
             self._timings["prepare_s"] = time.monotonic() - began
@@ -205,10 +211,12 @@ class Course:
                 self._sequence(session, method, recorder, ring, (step, sub))
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.
-                recorder.finish()
-                self._count(recorder.tally)
+                try:
+                    recorder.finish()
+                finally:
+                    self._count(recorder.tally)
             self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
-            truth = self._rig.camera.call(lambda c: c.truth(), CALL_S, session)
+            truth = self._truth(session)
             self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
             return self._conclude(recorder, info, truth)
         finally:
@@ -243,6 +251,14 @@ class Course:
                 "check it, then `umbra resume`",
             ) from error
 
+    def _truth(self, session: Session) -> dict[str, Any]:
+        """What a simulated camera knows; a scan does not fail for the lack of it."""
+        try:
+            return self._rig.camera.call(lambda c: c.truth(), TRUTH_S, session)
+        except DeviceError as error:
+            log.warning("no truth to compare with", problem=str(error))
+            return {}
+
     # ------------------------------------------------------------ before
 
     def _configure(
@@ -251,15 +267,14 @@ class Course:
         """Set the camera as the spec asks, or exactly as it was before an interruption."""
         wanted = CameraSettings(exposure_us=spec.exposure_us, gain=spec.gain)
         if before is not None and (known := before.get("settings")):
-            wanted = CameraSettings(exposure_us=known["exposure_us"], gain=known["gain"])
+            wanted = msgspec.convert(known, CameraSettings)
         if isinstance(spec, OccluderScan) and spec.frame_rate_hz is not None:
             wanted = replace(wanted, frame_rate_hz=spec.frame_rate_hz)
         camera = self._rig.camera
         in_force = camera.call(lambda c: c.configure(wanted), CALL_S, session)
         self._exposure_s = (in_force.exposure_us or 0.0) * 1e-6
         return {
-            "exposure_us": in_force.exposure_us,
-            "gain": in_force.gain,
+            **{name: value for name, value in asdict(in_force).items() if value is not None},
             "pixel_format": camera.device.info().pixel_format.value,
         }
 
@@ -296,12 +311,17 @@ class Course:
             pixels=self._config.storage.keep_frames,
         )
 
-    def _replay(self, recorder: Recorder, resuming: bool) -> tuple[int, int]:
+    def _replayed(self, session: Session) -> None:
+        """A frame of before has been taken in: a sign of life, and the place to be aborted."""
+        self.beat = time.monotonic()
+        self.control.check(session)
+
+    def _replay(self, session: Session, recorder: Recorder, resuming: bool) -> tuple[int, int]:
         if not resuming:
             return 0, 0
         self._say("taking in what was recorded before the interruption")
         self._same_sun()
-        step, sub = recorder.replay()
+        step, sub = recorder.replay(lambda: self._replayed(session))
         log.info("resumed", step=step, sub=sub, recorded=recorder.tally.recorded)
         return step, sub
 
@@ -375,6 +395,7 @@ class Course:
         self._on_progress(self.progress())
 
     def _update(self, **changes: Any) -> None:
+        self.beat = time.monotonic()
         self.folder.update(**changes)
         self._on_change()
 
@@ -384,6 +405,7 @@ class Course:
     # ------------------------------------------------------------ after
 
     def _conclude(self, recorder: Recorder, info: CameraInfo, truth: Mapping[str, Any]) -> End:
+        self.beat = time.monotonic()
         self._update(state=RunState.FINISHING)
         self._say("writing products")
         began = time.monotonic()
@@ -417,8 +439,11 @@ class Course:
                 state=end.state, end=end, ended=utc_now(), timings=dict(self._timings)
             )
         except (OSError, UmbraError):
-            # The disk refuses even this: after a restart the run is `interrupted`, which is true.
-            log.exception("the run's end could not be written")
+            # Known here, and written as soon as the disk takes it (`Runner.tend`).
+            log.exception("the run's end could not be written yet")
+            self.folder.remember(
+                state=end.state, end=end, ended=utc_now(), timings=dict(self._timings)
+            )
         say = log.info if end.state is RunState.DONE else log.warning
         say("run " + end.state, reason=end.reason, code=end.code, by=end.by)
         self._on_change()

@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 
 import structlog
 
-from drivers.base import Device, DeviceTimeout
+from drivers.base import Device, DeviceError, DeviceGarbled, DeviceTimeout
 
 D = TypeVar("D", bound=Device)
 T = TypeVar("T")
@@ -60,6 +60,16 @@ class _Task:
     deadline_s: float
     session: Session | None
     future: Future[Any]
+
+
+def _broken(device: str, error: BaseException) -> DeviceError:
+    """An exception that a driver should not have raised, as one that the daemon understands."""
+    broken = DeviceGarbled(
+        device, "call", f"the driver broke: {type(error).__name__}: {error}",
+        "umbrad's log has the traceback",
+    )  # fmt: skip
+    broken.__cause__ = error
+    return broken
 
 
 class DeviceThread(Generic[D]):
@@ -144,8 +154,11 @@ class DeviceThread(Generic[D]):
                 if task.session is not None:
                     task.session.check()
                 task.future.set_result(task.act(self.device))
-            except BaseException as error:  # noqa: BLE001 - it travels to the caller
+            except (DeviceError, Revoked) as error:
                 task.future.set_exception(error)
+            except BaseException as error:  # whatever a vendor's library raises
+                log.exception("a driver broke", device=self.device.name)
+                task.future.set_exception(_broken(self.device.name, error))
             finally:
                 self._due = None
                 del task  # a frame's buffer must not outlive its call here

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 
+from daemon.devicethread import Revoked
 from daemon.scans.method import Unsuitable
 from daemon.separation.estimator import NotYet
 from drivers.base import (
@@ -32,10 +33,8 @@ def as_error(error: BaseException) -> UmbraError:
     if isinstance(error, DeviceError):
         code = next((c for kind, c in _KINDS if isinstance(error, kind)), Code.DEVICE_GARBLED)
         return UmbraError(code, str(error))
-    if isinstance(error, Unsuitable):
-        return UmbraError(Code.UNSUITABLE, str(error), error.where)
-    if isinstance(error, NotYet):
-        return UmbraError(Code.NO_RESULT, str(error))
+    if isinstance(error, Unsuitable | NotYet | Revoked):
+        return _of_course(error)
     if isinstance(error, OSError):
         full = error.errno in {errno.ENOSPC, errno.EDQUOT}
         return UmbraError(
@@ -46,3 +45,16 @@ def as_error(error: BaseException) -> UmbraError:
     return UmbraError(
         Code.INTERNAL, f"{type(error).__name__}: {error}; the daemon's log has the details"
     )
+
+
+def _of_course(error: Unsuitable | NotYet | Revoked) -> UmbraError:
+    """What may happen to any scan or command, and is nobody's fault."""
+    match error:
+        case Unsuitable():
+            return UmbraError(Code.UNSUITABLE, str(error), error.where)
+        case NotYet():
+            return UmbraError(Code.NO_RESULT, str(error))
+        case Revoked():
+            return UmbraError(
+                Code.BUSY, "the devices were taken away: by an abort, a stop, or a scan"
+            )

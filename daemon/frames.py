@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 import struct
 import zlib
 from array import array
@@ -104,6 +105,8 @@ class FrameStore:
         with storage("creating frames.zarr"):
             if pixels:
                 layout = _Layout(shape, np.dtype(dtype))
+                if (folder / ARRAY).exists() and not (folder / LINES).exists():
+                    shutil.rmtree(folder / ARRAY)  # left by a crash within this very function
                 (folder / ARRAY).mkdir()
                 atomic_write(folder / ARRAY / "zarr.json", layout.metadata(0))
             (folder / LINES).touch(exist_ok=False)

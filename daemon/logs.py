@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import sys
 from collections import deque
 from collections.abc import MutableMapping
-from typing import Any
+from typing import Any, TextIO, cast
 
 import structlog
 
@@ -32,6 +33,21 @@ class LogBook:
         """The last records of a run ("" : of everything), oldest first."""
         chosen = [r for r in list(self._records) if not run or r.get("run") == run]
         return tuple(chosen[-limit:])
+
+
+class _Stderr:
+    """Standard error that may go away: a log nobody reads any more must not stop a rig."""
+
+    def write(self, text: str) -> int:
+        """Write, or lose, the text."""
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush what can be flushed."""
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
 
 
 def _plain(value: Any) -> Any:
@@ -61,7 +77,7 @@ def configure(level: str = "info") -> LogBook:
         wrapper_class=structlog.make_filtering_bound_logger(
             logging.getLevelNamesMapping()[level.upper()]
         ),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        logger_factory=structlog.PrintLoggerFactory(cast(TextIO, _Stderr())),
         cache_logger_on_first_use=True,
     )
     return book

@@ -17,15 +17,19 @@ import numpy as np
 import structlog
 
 from daemon.devicethread import Session
+from daemon.live import Live
 from daemon.manualstage import ManualStage
 from daemon.patterns import render
 from daemon.rig import SAFE_S, Rig
+from daemon.scans.method import Bench
+from daemon.scans.single_image import SingleImageMethod
 from daemon.sequencer import CALL_S, SHOW_S
 from daemon.viewfinder import Viewfinder
 from drivers.base import Acquisition, Camera, CameraInfo, CameraSettings, DeviceError, Frame
 from protocol.errors import Code, UmbraError
 from protocol.messages import AnyEvent, LockInfo
-from protocol.patterns import AnyPattern
+from protocol.patterns import AnyPattern, Stripes
+from protocol.scans import SingleImage
 
 _FRAME_S = 2.0
 _LIGHT_S = 600.0
@@ -57,6 +61,7 @@ class Manual:
         """`on_change` and `publish` must be safe to call from any thread."""
         self._rig = rig
         self.stage = ManualStage(rig, self.use, self._keep, publish)
+        self.live = Live(rig, viewfinder, self.use)
         self._viewfinder = viewfinder
         self._on_change = on_change
         self._mutex = threading.RLock()
@@ -132,6 +137,10 @@ class Manual:
         """Call now and then: end what nobody renewed. Never blocks."""
         now = time.monotonic()
         with self._mutex:
+            if self._session is not None and self._session.ended.is_set():
+                self._rig.leave(self._session)  # an emergency stop took it
+                self._session = None
+                self._on_change()
             if self._lock is not None and now >= self._lock.until:
                 log.warning("lock lost its heartbeat: safe state", owner=self._lock.owner)
                 self._lock = None
@@ -195,6 +204,21 @@ class Manual:
         image = render(pattern, info.width, info.height)
         projector.call(lambda p: p.show(image), SHOW_S, session)
 
+    def look(
+        self, rate_hz: float, lease_s: float, separate: SingleImage | None, bench: Bench | None
+    ) -> None:
+        """Look through the camera live; with `separate` under its stripes, which are shown.
+
+        Raises UmbraError, DeviceError, Unsuitable.
+        """
+        method = None
+        if separate is not None and bench is not None:
+            method = SingleImageMethod(separate, bench)
+            if not self.live.separating:
+                stripes = Stripes(width=separate.stripe, axis=separate.axis)
+                self.show(stripes, lease_s)
+        self.live.start(rate_hz, lease_s, method)
+
     def light(self, name: str, on: bool) -> None:
         """Switch a light by hand. Raises UmbraError(device_missing), DeviceError."""
         thread = self._rig.lights.get(name)
@@ -213,6 +237,7 @@ class Manual:
         def take(cam: Camera) -> tuple[Frame, CameraInfo]:
             info = cam.info()
             out = np.zeros(info.shape, info.pixel_format.dtype)
+            cam.stop()  # a live view may have left it acquiring
             cam.start(Acquisition.SOFTWARE)
             try:
                 cam.trigger()
@@ -223,7 +248,8 @@ class Manual:
 
         exposure_s = (camera.device.settings().exposure_us or 0.0) * 1e-6
         try:
-            frame, info = camera.call(take, exposure_s + 2 * CALL_S, session)
+            with self.live.aside():
+                frame, info = camera.call(take, exposure_s + 2 * CALL_S, session)
         except DeviceError as error:
             self._rig.failed(error)
             raise
@@ -240,8 +266,14 @@ class Manual:
             return camera.device.settings()
         was_active = self.active
         session = self.use(_FRAME_S)
+
+        def set_camera(device: Camera) -> CameraSettings:
+            device.stop()  # a live view may have left it acquiring
+            return device.configure(wanted)
+
         try:
-            return camera.call(lambda c: c.configure(wanted), CALL_S, session)
+            with self.live.aside():
+                return camera.call(set_camera, CALL_S, session)
         finally:
             if not was_active:
                 self.end()

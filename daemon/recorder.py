@@ -117,9 +117,10 @@ class Recorder:
 
     # ------------------------------------------------------------ for the sequencer
 
-    def replay(self) -> tuple[int, int]:
+    def replay(self, on_frame: Callable[[], None]) -> tuple[int, int]:
         """Feed the estimator with what an interrupted run recorded; before `start`.
 
+        `on_frame` is called for each and may raise to end it.
         Gives the step and sub-index to go on with. Raises the store's named error for a damaged
         frame.
         """
@@ -127,6 +128,7 @@ class Recorder:
         recorded = missing = rejected = 0
         scratch: Buffer | None = None
         for record in self._frames.records():
+            on_frame()
             position = (record.step, record.sub + 1)
             if record.missing:
                 missing += 1

@@ -19,6 +19,7 @@ import numpy as np
 from daemon.display import Picture
 from daemon.frames import FrameRecord
 from daemon.quality import BITS, Bit
+from daemon.separation.finish import ADVICE
 from daemon.store import RunFile
 from protocol.messages import Product
 
@@ -112,7 +113,8 @@ def advice(subject: Subject) -> list[str]:
     lines += facts.get("advice", [])  # the estimator's own
     for bit in _seen(facts):
         share = _share(facts, bit.name)
-        if share >= _ADVISED_FROM:
+        said = ADVICE[bit.flag][1] if bit.flag in ADVICE else None
+        if share >= _ADVISED_FROM and not (said and any(said in line for line in lines)):
             lines.append(f"{_percent(share)} of the pixels: {_lower(bit.meaning)} {bit.remedy}")
     top = subject.white / subject.full_scale
     if top < _DIM_BELOW and _share(facts, "saturated") < _ADVISED_FROM:
@@ -296,7 +298,7 @@ def _settings(subject: Subject) -> Iterable[tuple[str, Any]]:
 def asked(file: RunFile) -> Iterable[tuple[str, Any]]:
     """What a run was told."""
     for key, value in msgspec.to_builtins(file.spec).items():
-        if key not in {"method", "note"} and value is not None:
+        if key not in {"method", "note", "points"} and value is not None:
             yield key, value
     yield from file.rig.get("settings", {}).items()
 

@@ -52,6 +52,7 @@ class _Member:
     failures: int = 0
     next_try: float = 0.0
     pending: Future[Any] | None = None  # a connect or check under way
+    stale: Future[Any] | None = None  # one that was asked before the device was seen to be lost
 
     @property
     def device(self) -> Device:
@@ -87,6 +88,7 @@ class Rig:
         self._lock = threading.Lock()
         self._members: dict[str, _Member] = {}
         self._session: Session | None = None
+        self._latched = False  # an emergency stop is in force
         for table in config.devices:
             device = registry.build(table.kind, table.driver, table.name, table.options, context)
             self._members[table.name] = _Member(DeviceThread(device), table.driver)
@@ -148,11 +150,22 @@ class Rig:
             calibration=calibration,
         )
 
+    @property
+    def ready(self) -> bool:
+        """Whether there is a camera, and every device is ready."""
+        members = self._members.values()
+        return self._only("camera") is not None and all(m.health is Health.READY for m in members)
+
     def require_ready(self) -> None:
         """Raise UmbraError(device_lost) naming the first device that is not ready."""
         self._need("camera")
+        for kind in dict.fromkeys(m.device.kind for m in self._members.values()):
+            self.require_kind(kind)
+
+    def require_kind(self, kind: str) -> None:
+        """Raise UmbraError(device_lost) naming a device of this kind that is not ready."""
         for member in self._members.values():
-            if member.health is not Health.READY:
+            if member.device.kind == kind and member.health is not Health.READY:
                 raise UmbraError(
                     Code.DEVICE_LOST,
                     f"{member.device.name} ({member.driver}) is {member.health}: {member.message}",
@@ -192,6 +205,7 @@ class Rig:
         if member is None:
             return
         if isinstance(error, DeviceLost) or member.thread.stuck:
+            member.stale = member.pending
             self._set(member, Health.STUCK if member.thread.stuck else Health.LOST, str(error))
 
     def _connecting(self, member: _Member) -> Callable[[Device], None]:
@@ -222,6 +236,9 @@ class Rig:
     def _finish(self, member: _Member, wait_s: float) -> None:
         pending, member.pending = member.pending, None
         if pending is None:
+            return
+        if pending is member.stale and pending.done():
+            member.next_try = time.monotonic()  # what it says is older than the loss
             return
         try:
             if wait_s:
@@ -254,8 +271,12 @@ class Rig:
     # ------------------------------------------------------------ use and safety
 
     def take(self, owner: str) -> Session:
-        """Begin a session: the one user of the devices. Raises UmbraError(busy)."""
+        """Begin a session: the one user of the devices. Raises UmbraError(busy, estopped)."""
         with self._lock:
+            if self._latched:
+                raise UmbraError(
+                    Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it"
+                )
             if self._session is not None and not self._session.ended.is_set():
                 raise UmbraError(Code.BUSY, f"the rig is in use: {self._session.owner}")
             self._session = Session(owner)
@@ -267,6 +288,16 @@ class Rig:
         with self._lock:
             if self._session is session:
                 self._session = None
+
+    def latch(self) -> None:
+        """From now on nobody gets the devices: an emergency stop. `make_safe` follows."""
+        with self._lock:
+            self._latched = True
+
+    def unlatch(self) -> None:
+        """The emergency stop is over."""
+        with self._lock:
+            self._latched = False
 
     def make_safe(self, *, halt: bool = True) -> list[Future[None]]:
         """Revoke the session and send every device to its safe state, from any thread, at once.

@@ -1,6 +1,7 @@
 """The queue, and the life of a run: which one is next, and what people may do to it.
 
-All methods are called from the loop; the course of the current run is a thread of its own.
+Commands may come from any thread; runs are begun from the loop only, and the course of the current
+one is a thread of its own.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from daemon.scans.catalog import method_for
 from daemon.scans.method import Unsuitable
 from daemon.store import RunFolder, Store
 from daemon.viewfinder import Viewfinder
+from drivers.base import DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages import (
     AnyEvent,
@@ -73,6 +75,8 @@ class Runner:
         self._make_way = make_way
         self._course: Course | None = None
         self._wake = asyncio.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._choosing = threading.Lock()  # a run is begun or taken from the queue, never both
         self._held: set[str] = set()
         self._of_holder: set[str] = set()  # runs submitted by whoever holds the rig
         self._stopping = False
@@ -84,35 +88,54 @@ class Runner:
         for run in self._store.runs():
             if run.file.state in _UNFINISHED:
                 reason = "umbrad ended while the run was under way; `umbra resume` goes on with it"
-                run.update(
-                    state=RunState.INTERRUPTED,
-                    ended=utc_now(),
-                    end=End(state=RunState.INTERRUPTED, reason=reason),
-                )
+                end = End(state=RunState.INTERRUPTED, reason=reason)
+                run.remember(state=RunState.INTERRUPTED, ended=utc_now(), end=end)
                 log.warning("run interrupted", run=run.id)
+        self.tend()
+
+    def tend(self) -> None:
+        """Call now and then: write ends that a full disk refused. Blocks for an fsync if so."""
+        for run in self._store.runs():
+            if run.unwritten:
+                try:
+                    run.flush()
+                except UmbraError as error:
+                    log.warning("a run's end is still not written", run=run.id, error=error.message)
 
     async def serve(self) -> None:
         """Run what is queued until `stop`."""
+        self._loop = asyncio.get_running_loop()
         while not self._stopping:
-            run = self._next()
-            if run is None:
-                self._wake.clear()
+            self._wake.clear()
+            with self._choosing:
+                course = self._begin()
+            if course is None:
                 await self._wake.wait()
                 continue
-            await self._run(run)
+            await self._run(course)
 
-    def _next(self) -> RunFolder | None:
-        if self._stopping or self._held - {LOCK}:
+    def wake(self) -> None:
+        """Look again whether a run can begin; from any thread."""
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._wake.set)
+
+    @property
+    def waits_for(self) -> str:
+        """Why runs wait although none is under way; "" if they don't."""
+        if not self._store.queued():
+            return ""
+        try:
+            self._rig.require_ready()
+        except UmbraError as error:
+            return error.message
+        return ", ".join(sorted(self._held))
+
+    def _begin(self) -> Course | None:
+        """The course of the next run that may begin, if there is one; it is current from now on."""
+        run = self._next()
+        if run is None:
             return None
-        waiting = self._store.queued()
-        if LOCK in self._held:
-            waiting = [run for run in waiting if run.id in self._of_holder]
-        return next(iter(waiting), None)
-
-    async def _run(self, run: RunFolder) -> None:
-        loop = asyncio.get_running_loop()
-        ended = loop.create_future()
-        course = self._course = Course(
+        self._course = Course(
             run,
             rig=self._rig,
             store=self._store,
@@ -121,28 +144,52 @@ class Runner:
             on_change=lambda: self._publish(RunChanged(run=run.info())),
             on_progress=lambda p: self._publish(Progressed(progress=p)),
         )
+        return self._course
+
+    def _next(self) -> RunFolder | None:
+        if self._stopping or self._held - {LOCK}:
+            return None
+        waiting = self._store.queued()
+        if LOCK in self._held:
+            waiting = [run for run in waiting if run.id in self._of_holder]
+        if not waiting or not self._rig.ready:
+            return None  # a device that is away fails no run that has not begun
+        return waiting[0]
+
+    async def _run(self, course: Course) -> None:
+        loop = asyncio.get_running_loop()
+        ended = loop.create_future()
 
         def execute() -> None:
-            course.execute()
-            loop.call_soon_threadsafe(ended.set_result, None)
+            try:
+                self._clear_the_way()
+                course.execute()
+            finally:
+                loop.call_soon_threadsafe(ended.set_result, None)
 
         self._on_activity()
-        log.info("run begins", run=run.id)
-        await asyncio.to_thread(self._make_way)
+        log.info("run begins", run=course.folder.id)
         thread = threading.Thread(target=execute, name="umbra-sequencer")
         thread.start()
         await ended
         thread.join()
         self._course = None
         if not self._stopping:
-            await asyncio.to_thread(aftermath.after, run, self._store, self._config)
+            await asyncio.to_thread(aftermath.after, course.folder, self._store, self._config)
         self._publish(QueueChanged(queue=tuple(r.id for r in self._store.queued())))
         self._on_activity()
 
-    async def stop(self) -> None:
+    def _clear_the_way(self) -> None:
+        """End manual work; where that fails the course finds the rig in use, and says so."""
+        try:
+            self._make_way()
+        except (UmbraError, DeviceError) as error:
+            log.warning("manual work did not end", error=str(error))
+
+    def stop(self) -> None:
         """For shutdown: the current run is interrupted, and can be resumed after a restart."""
         self._stopping = True
-        course = self._course
+        course = self._active
         if course is not None:
             course.control.end(RunState.INTERRUPTED, "umbrad was stopped; `umbra resume` goes on")
             self._rig.make_safe()
@@ -154,10 +201,12 @@ class Runner:
 
     def release(self, why: str) -> None:
         """The reason to hold is gone."""
+        if why not in self._held:
+            return
         self._held.discard(why)
         if why == LOCK:
             self._of_holder.clear()
-        self._wake.set()
+        self.wake()
 
     def end_for_estop(self, by: str) -> None:
         """The devices have been stopped: the current run ends as aborted."""
@@ -208,6 +257,10 @@ class Runner:
         return newest
 
     # ------------------------------------------------------------ commands
+
+    def submitted(self, request_id: str) -> RunFolder | None:
+        """The run that a request has made before, also before a restart."""
+        return self._store.find_request(request_id)
 
     def submit(
         self, spec: AnyScan, by: str, request_id: str, *, first: bool, holder: bool
@@ -270,18 +323,28 @@ class Runner:
         self._queue_changed(folder)
         return folder
 
-    def abort(self, run: str, by: str) -> RunFolder:
-        """End a run that waits, runs or is paused; the devices go to their safe state at once."""
+    def abort_current(self, run: str, by: str) -> RunFolder | None:
+        """End the run under way, if it is this one; the devices go to their safe state at once.
+        Never blocks."""
         course = self._active
-        if course is not None and run in {"", course.folder.id}:
-            course.control.end(RunState.ABORTED, "aborted", by=by)
-            self._rig.make_safe()
-            return course.folder
+        if course is None or run not in {"", course.folder.id}:
+            return None
+        course.control.end(RunState.ABORTED, "aborted", by=by)
+        self._rig.make_safe()
+        return course.folder
+
+    def abort(self, run: str, by: str) -> RunFolder:
+        """End a run that waits, runs or is paused. Blocks for an fsync."""
+        if (current := self.abort_current(run, by)) is not None:
+            return current
         if not run:
             raise UmbraError(Code.WRONG_STATE, "no run is under way; name the one: `umbra queue`")
-        waiting = self._waiting(run)
-        end = End(state=RunState.ABORTED, reason="taken from the queue", by=by)
-        waiting.update(state=RunState.ABORTED, end=end, ended=utc_now())
+        with self._choosing:
+            if (current := self.abort_current(run, by)) is not None:  # it has begun meanwhile
+                return current
+            waiting = self._waiting(run)
+            end = End(state=RunState.ABORTED, reason="taken from the queue", by=by)
+            waiting.update(state=RunState.ABORTED, end=end, ended=utc_now())
         self._queue_changed(waiting)
         return waiting
 
@@ -305,4 +368,4 @@ class Runner:
     def _queue_changed(self, run: RunFolder) -> None:
         self._publish(RunChanged(run=run.info()))
         self._publish(QueueChanged(queue=tuple(r.id for r in self._store.queued())))
-        self._wake.set()
+        self.wake()

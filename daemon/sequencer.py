@@ -42,6 +42,7 @@ from drivers.base import (
     Camera,
     CameraInfo,
     CameraSettings,
+    DeviceError,
     DeviceGarbled,
     DeviceTimeout,
     EndOfRecording,
@@ -58,6 +59,10 @@ _RING_S = 30.0
 """How long a stepped scan waits for the recorder before it says that the disk does not keep up."""
 
 log = structlog.get_logger(__name__)
+
+
+_GAP = 10_000
+"""Frames that a stream may lose at once; a larger step in their numbers is garbage."""
 
 
 class Behind(Exception):
@@ -117,6 +122,8 @@ class Sequencer:
         self._latency_ns = round(float(calibration.get("latency_s", 0.0)) * NS)
         self._tone: list[int] | None = calibration.get("tone")
         self._exposure_us = self._camera.device.settings().exposure_us
+        self._silent = 0  # grabs of a stream in a row that gave nothing
+        self._last_sequence: int | None = None
         self._lit: Expose | None = None
         self._lit_ns = 0
         self._lit_image: NDArray[np.uint8] | None = None
@@ -144,10 +151,17 @@ class Sequencer:
                     self._watch(step_index, step, sub)
                 step_index, sub = step_index + 1, 0
             self._settle()
-        finally:
-            if not self._session.ended.is_set():
-                self._camera.call(lambda c: c.stop(), CALL_S, self._session)
-                self._set_exposure(None)
+        except DeviceError:
+            raise  # the device that failed is named, not the stop that must fail after it
+        except BaseException:
+            self._stop_camera()
+            raise
+        self._stop_camera()
+
+    def _stop_camera(self) -> None:
+        if not self._session.ended.is_set():
+            self._camera.call(lambda c: c.stop(), CALL_S, self._session)
+            self._set_exposure(None)
 
     def _summary(self) -> Mapping[str, float]:
         return self._recorder.summary
@@ -267,6 +281,7 @@ class Sequencer:
         """See the frame that is being read out to its end: recorded, repeated, or missing."""
         while (exposure := self._pending) is not None:
             problem: str
+            self._may_go_on()
             try:
                 frame = self._camera.wait(exposure.grab, self._frame_deadline() + CALL_S)
                 problem = self._proof(exposure, frame)
@@ -400,10 +415,9 @@ class Sequencer:
                 self._ring.give(buffer)
             if mover is not None:
                 mover.check()
-            self._miss(index, step, sub, "no frame came in time")
-            return sub + 1, last
+            return sub, last  # what was exposed meanwhile shows as a gap in the sequence
         lost = 0 if last is None else max(0, frame.sequence - last - 1)
-        for _ in range(lost):
+        for _ in range(lost if step.frames is None else min(lost, step.frames - sub - 1)):
             self._miss(index, step, sub, "lost between camera and host")
             sub += 1
         if behind:
@@ -417,14 +431,27 @@ class Sequencer:
         """The next frame of a stream; None if none came in time."""
         timeout_s = self._frame_deadline()
         try:
-            return self._camera.call(
+            frame = self._camera.call(
                 lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, self._session
             )
         except Stuck:
             raise
-        except DeviceTimeout as error:
-            log.warning("no frame", problem=str(error))
+        except (DeviceTimeout, DeviceGarbled) as error:
+            self._silent += 1
+            if self._silent >= self._patience.attempts:
+                raise
+            log.warning("no frame", problem=str(error), silent=self._silent)
             return None
+        self._silent = 0
+        if not 0 <= frame.sequence - (self._last_sequence or frame.sequence) <= _GAP:
+            raise DeviceGarbled(
+                self._camera.device.name,
+                "grab",
+                f"frame number {frame.sequence} came after {self._last_sequence}",
+                "reconnect the camera",
+            )
+        self._last_sequence = frame.sequence
+        return frame
 
     # ------------------------------------------------------------ both
 
@@ -439,6 +466,7 @@ class Sequencer:
 
         self._camera.call(start, CALL_S, self._session)
         self._acquisition = wanted
+        self._last_sequence = None
 
     def _put(
         self,

@@ -92,7 +92,11 @@ class Server:
     async def _serve_one(self, parts: list[zmq.Frame]) -> None:
         if len(parts) < 2:
             return  # not even a header: nobody to answer
-        caller = self._caller_of(parts[1])
+        try:
+            caller = self._caller_of(parts[1])
+        except UmbraError as error:
+            log.warning("nobody can be known", error=error.message)
+            return
         if caller is None:
             return  # a key that was revoked: strangers get no reply
         frames = await self._answer(bytes(parts[1].buffer), len(parts) - 2, caller)

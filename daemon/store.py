@@ -86,6 +86,7 @@ class RunFolder:
     def __init__(self, path: Path, file: RunFile) -> None:
         self.path = path
         self.file = file
+        self.unwritten = False  # something is only remembered here
         self._lock = threading.Lock()
 
     @classmethod
@@ -112,6 +113,18 @@ class RunFolder:
         """
         with self._lock:
             return self._replace(changes)
+
+    def remember(self, **changes: Any) -> None:
+        """Change fields here only, when the disk refuses them; `flush` writes them later."""
+        with self._lock:
+            self.file = msgspec.structs.replace(self.file, **changes)
+            self.unwritten = True
+
+    def flush(self) -> None:
+        """Write what was only remembered. Raises StorageError."""
+        if self.unwritten:
+            self.update()
+            self.unwritten = False
 
     def add_products(self, products: Iterable[Product]) -> RunFile:
         """Add to the list of products; one of the same name takes its place. As `update`."""
@@ -167,12 +180,13 @@ class Store:
         self._runs = data / "runs"
         self._known: dict[str, RunFolder] = {}
         self._lock = threading.RLock()
+        self._creating = threading.Lock()
         with storage(f"opening the data folder {data}"):
             self._runs.mkdir(parents=True, exist_ok=True)
             self._held = _hold(data / "umbrad.lock")
             for path in self._runs.glob(".*"):
                 shutil.rmtree(path)
-        self.runs()
+        self.scan()
 
     def __enter__(self) -> Store:
         return self
@@ -202,7 +216,7 @@ class Store:
 
         Raises StorageError; then there is no run.
         """
-        with self._lock:
+        with self._creating:  # and not the lock that readers take: this waits for the disk
             now = datetime.fromtimestamp(self._clock.utc_ns() / NS, UTC)
             orders = [run.file.order for run in self.queued()] or [0]
             file = RunFile(
@@ -227,7 +241,9 @@ class Store:
                     shutil.rmtree(coming, ignore_errors=True)
                     raise
                 fsync_folder(self._runs)
-            run = self._known[file.id] = RunFolder(path, file)
+            run = RunFolder(path, file)
+            with self._lock:
+                self._known[file.id] = run
             return run
 
     def open(self, id: str) -> RunFolder:
@@ -244,18 +260,22 @@ class Store:
             return self._known[id]
 
     def runs(self) -> list[RunFolder]:
-        """All runs, the newest first; folders that cannot be read are in `damaged` instead."""
+        """All runs, the newest first; from memory. What `scan` could not read is left out."""
         with self._lock:
-            found = []
+            known = list(self._known.values())
+        return sorted(known, key=lambda run: (run.file.submitted, run.id), reverse=True)
+
+    def scan(self) -> None:
+        """Look at the folders anew; those that cannot be read are in `damaged`."""
+        with self._lock:
+            there = [p for p in self._runs.iterdir() if p.name[0] != "." and p.is_dir()]
+            self._known = {p.name: self._known[p.name] for p in there if p.name in self._known}
             self.damaged = {}
-            for path in self._runs.iterdir():
-                if path.name.startswith(".") or not path.is_dir():
-                    continue
+            for path in there:
                 try:
-                    found.append(self.open(path.name))
+                    self.open(path.name)
                 except UmbraError as error:
                     self.damaged[path.name] = error.message
-            return sorted(found, key=lambda run: (run.file.submitted, run.id), reverse=True)
 
     def queued(self) -> list[RunFolder]:
         """The runs that wait, the next first."""
@@ -294,6 +314,23 @@ class Store:
                     total -= sizes[run.id]
                     gone.append(run.id)
             return gone
+
+    # ------------------------------------------------------------ marks
+
+    def mark(self, name: str) -> None:
+        """Remember durably that something is so, until `unmark`. Raises StorageError."""
+        with storage(f"marking {name}"):
+            atomic_write(self.data / name, b"")
+
+    def unmark(self, name: str) -> None:
+        """It is so no longer; idempotent. Raises StorageError."""
+        with storage(f"unmarking {name}"):
+            (self.data / name).unlink(missing_ok=True)
+            fsync_folder(self.data)
+
+    def marked(self, name: str) -> bool:
+        """Whether it was marked, also before a restart."""
+        return (self.data / name).exists()
 
     # ------------------------------------------------------------ room
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -95,8 +96,8 @@ class DisplayProjector(Projector):
     """See the module. `show` also takes (H, W, 3) RGB, for drivers that send bit planes.
 
     The moment that `show` gives is the flip's plus `latency_frames` refreshes: measure those
-    (`umbra calibrate latency`), the default is what slow projectors need. In the safe state it
-    shows black; the lamp stays on.
+    (docs/projectors.md), the default is what slow projectors need. The safe state is black, the
+    lamp stays on; `safe` returns when it is black by the same reckoning.
     """
 
     options_type = DisplayOptions
@@ -109,6 +110,7 @@ class DisplayProjector(Projector):
         self._size = (0, 0)
         self._refresh_hz = 0.0
         self._facts: dict[str, Any] = {}
+        self._halted = threading.Event()
         self._next = 0  # windowed: when the next refresh would be
 
     # ------------------------------------------------------------ life
@@ -139,12 +141,6 @@ class DisplayProjector(Projector):
     def _open(self) -> Identity:
         _start(self._o.video_driver)
         driver = pygame.display.get_driver()
-        if driver in {"dummy", "offscreen"}:
-            raise self._refuse(
-                "connect",
-                f"SDL found no display: its {driver} driver shows nothing",
-                NO_DISPLAY,
-            )
         index = self._find(_names(driver))
         output = pygame.display.get_desktop_sizes()[index]
         size = self._o.size or output
@@ -159,9 +155,11 @@ class DisplayProjector(Projector):
                     "set the output's mode: nothing is ever scaled",
                 )
             flags = pygame.FULLSCREEN | pygame.SCALED  # SCALED, at the output's size, is for vsync
-        surface = pygame.display.set_mode(
-            size, flags, display=index, vsync=0 if self._o.windowed else 1
-        )
+        with warnings.catch_warnings(record=True) as slow:  # "no fast renderer": without a GPU
+            warnings.simplefilter("always")
+            surface = pygame.display.set_mode(
+                size, flags, display=index, vsync=0 if self._o.windowed else 1
+            )
         pygame.mouse.set_visible(False)
         pygame.display.set_allow_screensaver(False)
         self._surface, self._size = surface, size
@@ -173,6 +171,7 @@ class DisplayProjector(Projector):
             "sdl": ".".join(map(str, pygame.get_sdl_version())),
             "video_driver": driver,
             "refresh_hz": round(self._refresh_hz, 3),
+            "flips_by": "timer" if slow or self._o.windowed else "output",
             "channel": self._o.channel,
         }
         return Identity(f"display {name} {size[0]}x{size[1]}", "", f"SDL {self._facts['sdl']}")
@@ -202,7 +201,7 @@ class DisplayProjector(Projector):
             moments.append(self.clock.now_ns())
         rate = NS / max(1.0, float(np.median(np.diff(moments))))
         told = self._o.refresh_hz
-        if rate > FASTEST_HZ:
+        if rate > FASTEST_HZ or not pygame.display.is_vsync():
             raise self._refuse(
                 "connect",
                 f"flips do not wait for the refresh ({rate:.0f} a second)",
@@ -247,11 +246,13 @@ class DisplayProjector(Projector):
             )
 
     def safe(self) -> None:
-        """See Device: black."""
-        self.show(np.zeros(self._size[::-1], np.uint8))
+        """See Device: black. A halt ends the wait for the light, not the flip."""
+        self._halted.clear()
+        self.clock.wait_until(self.show(np.zeros(self._size[::-1], np.uint8)), self._halted)
 
     def halt(self) -> None:
-        """See Device. No call blocks for longer than a refresh."""
+        """See Device. No flip blocks for longer than a refresh."""
+        self._halted.set()
 
     def close(self) -> None:
         """See Device."""
@@ -336,12 +337,21 @@ class DisplayProjector(Projector):
 
 
 def _start(video_driver: str) -> None:
-    """Start SDL's video in this thread. Raises pygame.error."""
+    """Start SDL's video in this thread. Raises pygame.error, also where nothing can be seen."""
     for key, value in HINTS.items():
         os.environ.setdefault(key, value)
     if video_driver:
+        before = os.environ.get("SDL_VIDEODRIVER")
         os.environ["SDL_VIDEODRIVER"] = video_driver
-    pygame.display.init()
+    try:
+        pygame.display.init()
+    finally:
+        if video_driver:
+            del os.environ["SDL_VIDEODRIVER"]
+            if before is not None:
+                os.environ["SDL_VIDEODRIVER"] = before
+    if (driver := pygame.display.get_driver()) in {"dummy", "offscreen"}:
+        raise pygame.error(f"no display was found (its {driver} driver shows nothing)")
 
 
 def _names(driver: str) -> list[str]:

@@ -66,10 +66,13 @@ class FlashImages:
                     f"give the {dmd.COLUMNS} x {dmd.ROWS} files that the firmware was made of",
                 )
             frame = np.asarray(picture[..., ::-1], np.uint8)
-            for bits, count in ((1, dmd.PLANES), (8, 3)):
-                for number in range(count):
-                    key = _digest(dmd.plane(frame, number, bits))
-                    self._found.setdefault(key, Place(index, number, bits))
+            for number in range(dmd.PLANES):
+                channel = frame[..., dmd.ORDER[number // 8]]
+                key = _digest(np.packbits(channel & np.uint8(1 << number % 8)))
+                self._found.setdefault(key, Place(index, number))
+            for number in range(3):
+                key = _digest(dmd.plane(frame, number, 8))
+                self._found.setdefault(key, Place(index, number, 8))
 
     def find(self, phase: str, mirrors: NDArray[np.uint8]) -> Place:
         """Where an image (1140, 912) is. Raises DeviceRefused."""
@@ -77,7 +80,8 @@ class FlashImages:
             return BLACK
         if (mirrors == 255).all():
             return WHITE
-        place = self._found.get(_digest(mirrors))
+        binary = np.count_nonzero(mirrors) == np.count_nonzero(mirrors == 255)
+        place = self._found.get(_digest(np.packbits(mirrors) if binary else mirrors))
         if place is None:
             raise DeviceRefused(
                 self._device,

@@ -38,7 +38,7 @@ from protocol.results import (
     separation_of,
     stage_of,
 )
-from protocol.scans import AnyScan
+from protocol.scans import AnyScan, SingleImage
 
 if TYPE_CHECKING:
     from protocol.aio import AsyncClient
@@ -206,6 +206,20 @@ class Commands:
     ) -> Ask[Picture]:
         """The latest frame, small (uint8, RGB)."""
         return Ask(m.GetPreview(width=width, what=what), picture_of("preview"))
+
+    @command
+    def live(
+        self, rate_hz: float = 4.0, lease_s: float = 10.0, separate: SingleImage | None = None
+    ) -> Ask[str]:
+        """Look through the camera live for `lease_s` more: subscribe to the topic preview."""
+        return Ask(
+            m.StartLive(rate_hz=rate_hz, lease_s=lease_s, separate=separate), message_of, SLOW_S
+        )
+
+    @command
+    def stop_live(self) -> Ask[str]:
+        """End the live view."""
+        return Ask(m.StopLive(), message_of, SLOW_S)
 
     @command
     def show(self, pattern: AnyPattern, lease_s: float = 600.0) -> Ask[str]:

@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 
 from protocol.errors import ErrorInfo
 from protocol.patterns import AnyPattern
-from protocol.scans import AnyScan
+from protocol.scans import AnyScan, SingleImage
 
 PROTOCOL = 1
 """The one version of everything in this package; both sides must have the same."""
@@ -386,10 +386,32 @@ class GetLog(Command, frozen=True, kw_only=True, tag="log"):
 
 
 class GetPreview(Command, frozen=True, kw_only=True, tag="preview"):
-    """The latest frame, small: array `preview` (uint8, RGB), with counts of saturated pixels."""
+    """The latest frame, small: array `preview` (uint8, RGB), with counts of saturated pixels.
+
+    Array `saturated` (uint8, of a frame): 1 where a pixel under it is at its full scale.
+    """
 
     width: Annotated[int, Meta(ge=16, le=4096)] = 640
     what: str = "frame"  # frame, direct, global
+
+
+class StartLive(Command, frozen=True, kw_only=True, tag="live"):
+    """Look through the camera live: pictures come as `preview-taken`, until nobody asks again.
+
+    Asked again it goes on for another `lease_s`. A run that begins ends it, and publishes previews
+    of its own. With `separate` its stripes are shown, and each frame's direct and global published.
+    """
+
+    role: ClassVar[Role] = Role.OPERATOR
+    rate_hz: Annotated[float, Meta(gt=0, le=15)] = 4.0  # fewer where they cost too much time
+    lease_s: Annotated[float, Meta(ge=1, le=600)] = 10.0
+    separate: SingleImage | None = None
+
+
+class StopLive(Command, frozen=True, kw_only=True, tag="stop-live"):
+    """End the live view; what is shown and lit by hand stays."""
+
+    role: ClassVar[Role] = Role.OPERATOR
 
 
 class Show(Command, frozen=True, kw_only=True, tag="show"):
@@ -503,7 +525,8 @@ class Unlock(Command, frozen=True, kw_only=True, tag="unlock"):
 AnyCommand = (
     Hello | GetStatus | GetDevices | Discover | Examine | Submit | GetQueue | MoveQueued
     | Pause | Resume | Abort | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct
-    | GetLog | GetPreview | Show | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove
+    | GetLog | GetPreview | StartLive | StopLive
+    | Show | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove
     | StageCircle | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
 )  # fmt: skip
 
@@ -658,6 +681,8 @@ ANSWERS: dict[type[Command], type[Reply]] = {
     GetProduct: ProductPart,
     GetLog: Log,
     GetPreview: Picture,
+    StartLive: Done,
+    StopLive: Done,
     Show: Done,
     Snap: Picture,
     SetCamera: Camera,
@@ -732,11 +757,14 @@ class StageChanged(EventBody, frozen=True, kw_only=True, tag="stage-changed"):
 
 
 class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
-    """A small picture of the latest frame or separation. Array: `preview` (uint8, RGB)."""
+    """A small picture of the latest frame or separation. Array: `preview` (uint8, RGB).
+
+    Array `saturated` (uint8, of the same size): 1 where a pixel under it is at its full scale.
+    """
 
     topic: ClassVar[str] = "preview"
-    run: str
-    what: str
+    run: str  # "": by hand
+    what: str  # frame, direct, global
     facts: dict[str, Any] = {}
 
 

@@ -22,6 +22,7 @@ class Picture:
 
     pixels: NDArray[Any]
     facts: dict[str, Any]
+    saturated: NDArray[np.uint8] | None = None  # of a preview: 1 where it is over-exposed
 
     def _repr_html_(self) -> str:
         shown = ", ".join(f"{k} {v}" for k, v in self.facts.items() if isinstance(v, int | float))
@@ -84,7 +85,7 @@ def picture_of(*names: str) -> Callable[[Answer], Picture]:
     def made(answer: Answer) -> Picture:
         reply = expect(answer.reply, m.Picture)
         name = next((n for n in names if n in answer.arrays), names[0])
-        return Picture(answer.array(name), reply.facts)
+        return Picture(answer.array(name), reply.facts, answer.arrays.get("saturated"))
 
     return made
 

@@ -351,7 +351,7 @@ class VerifyLitFraction(Verification, frozen=True, kw_only=True, tag="verify-lit
         tuple[Annotated[float, Meta(gt=0, lt=1)], ...],
         Meta(min_length=3, max_length=64, description="lit fractions α"),
     ] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-    draws: Annotated[int, Meta(ge=1, le=100, description="random patterns at each fraction")] = 4
+    draws: Annotated[int, Meta(ge=1, le=100, description="random patterns at each fraction")] = 8
     patch: Patch = 6
     seed: Seed = 1
 
@@ -361,6 +361,17 @@ class VerifyCheckerSize(Verification, frozen=True, kw_only=True, tag="verify-che
 
     sizes: PatchSizes = (2, 3, 4, 6, 8, 12, 16, 20, 24, 32)
     patch: Patch = 6
+
+
+class Advise(Measuring, frozen=True, kw_only=True, tag="advise"):
+    """A short sweep of checker sizes that says which pattern, how many images and what exposure
+    this scene needs for a wanted error, and what limits it (Appendix A)."""
+
+    error: Annotated[
+        float, Meta(gt=0, le=0.5, description="wanted in direct and global, of full scale")
+    ] = 0.01
+    sizes: PatchSizes = (2, 3, 4, 6, 8, 12, 16, 24)
+    average: Annotated[int, Meta(ge=2, le=1000, description="frames averaged a pattern")] = 2
 
 
 AnySeparation = (
@@ -376,4 +387,4 @@ AnySeparation = (
 )
 AnyCalibration = CalibrateDark | CalibrateNoise | CalibrateLeak | CalibrateTone | CalibrateLatency
 AnyVerification = VerifyPatchSize | VerifyRandomPatterns | VerifyLitFraction | VerifyCheckerSize
-AnyScan = AnySeparation | AnyCalibration | AnyVerification
+AnyScan = AnySeparation | AnyCalibration | AnyVerification | Advise

@@ -7,14 +7,23 @@ from collections.abc import Sequence
 import numpy as np
 
 from daemon.devicethread import DeviceThread, Session
-from daemon.doctor.verdict import failed, ok, warning
-from drivers.base import Projector
+from daemon.doctor.verdict import failed, ok, skipped, warning
+from drivers.base import DeviceRefused, Projector
 from drivers.clock import NS
 from protocol.messages import Check
 
 FLIPS = 16
 _SHOW_S = 5.0
 _TOLERANCE = 0.03
+
+
+def check(projector: DeviceThread[Projector], session: Session) -> Check:
+    """Flip, and judge. Raises DeviceError."""
+    try:
+        flips = measure(projector, session)
+    except DeviceRefused as error:  # a sequencer with a fixed store of patterns
+        return skipped("projector: refresh", f"it shows no free images: {error.problem}")
+    return refresh(flips, projector.device.info().refresh_hz)
 
 
 def measure(projector: DeviceThread[Projector], session: Session) -> list[int]:

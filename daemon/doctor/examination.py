@@ -97,10 +97,8 @@ class Doctor:
     def _exposing(self, session: Session) -> Iterator[Check]:
         projector = self._rig.projector
         if projector is not None:
-            info = projector.device.info
             yield from self._tried(
-                "projector: refresh",
-                lambda: [display.refresh(display.measure(projector, session), info().refresh_hz)],
+                "projector: refresh", lambda: [display.check(projector, session)]
             )
         camera_info = self._camera_info()
         if camera_info is None:
@@ -110,12 +108,10 @@ class Doctor:
         if camera_info.recorded:
             yield exposing.recorded()
             return
-        if "software" not in camera_info.triggers:
-            yield skipped("camera: trigger", "this camera runs free: it cannot be triggered")
-            return
+        judge = exposing.trigger if "software" in camera_info.triggers else exposing.stream
         yield from self._tried(
             "camera: trigger",
-            lambda: [exposing.trigger(exposing.shoot(camera, session, exposing.SHOTS))],
+            lambda: [judge(exposing.shoot(camera, session, exposing.SHOTS))],
         )
         if projector is not None:
             yield from self._tried(

@@ -39,20 +39,28 @@ class Shot:
 
 
 def shoot(camera: DeviceThread[Camera], session: Session, count: int = 1) -> list[Shot]:
-    """Trigger so many frames, each when the one before is here. Raises DeviceError."""
+    """Trigger so many frames, each when the one before is here. Raises DeviceError.
+
+    Of a camera that cannot be triggered: frames of its stream that began after they were asked for.
+    """
 
     def act(device: Camera) -> list[Shot]:
         info = device.info()
+        triggered = "software" in info.triggers
         full = info.pixel_format.full_scale
         out = np.zeros(info.shape, info.pixel_format.dtype)
         exposure_us = device.settings().exposure_us or 0.0
         shots = []
-        device.start(Acquisition.SOFTWARE)
+        patience_s = exposure_us * 1e-6 + info.readout_s + _PATIENCE_S
+        device.start(Acquisition.SOFTWARE if triggered else Acquisition.FREE)
         try:
             for _ in range(count):
                 asked = device.clock.now_ns()
-                device.trigger()
-                frame = device.grab(out, exposure_us * 1e-6 + info.readout_s + _PATIENCE_S)
+                if triggered:
+                    device.trigger()
+                frame = device.grab(out, patience_s)
+                while not triggered and frame.start_ns < asked:
+                    frame = device.grab(out, patience_s)
                 shots.append(
                     Shot(
                         mean=float(frame.pixels.mean()) / full,
@@ -98,6 +106,17 @@ def trigger(shots: Sequence[Shot]) -> Check:
     if latency_s > _LATE_S or here_s > _LATE_S:
         return warning(name, told, "a busy bus or host: use another port, a smaller roi")
     return ok(name, told)
+
+
+def stream(shots: Sequence[Shot]) -> Check:
+    """Of a camera that cannot be triggered: what comes, and how fast."""
+    apart = [b.start_ns - a.start_ns for a, b in pairwise(shots)]
+    return warning(
+        "camera: trigger",
+        f"it cannot be triggered; it runs free, with a frame every {np.median(apart) / 1e6:.1f} ms",
+        "it works, slower: frames that straddle a flip are skipped. A camera with a trigger is "
+        "faster",
+    )
 
 
 def periods(exposure_us: float, refresh_hz: float) -> Check:
@@ -170,7 +189,8 @@ def projector_checks(
     clock.wait(SETTLE_S, session.ended)
     [light] = shoot(camera, session)
     checks = lit("projector: light", dark, light)
-    if light.mean - dark.mean >= _SEEN:
+    free = "software" not in camera.device.info().triggers
+    if light.mean - dark.mean >= _SEEN and not free:
         checks.append(latency(dark, early, light))
     projector.call(lambda p: p.safe(), _CALL_S, session)
     checks.append(periods(light.exposure_us, info.refresh_hz))

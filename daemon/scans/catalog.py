@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from daemon.scans.advise import AdviseMethod
 from daemon.scans.calibrate_dark import DarkMethod
 from daemon.scans.calibrate_latency import LatencyMethod
 from daemon.scans.calibrate_leak import LeakMethod
@@ -23,6 +24,7 @@ from daemon.scans.verify_lit_fraction import VerifyLitFractionMethod
 from daemon.scans.verify_patch_size import VerifyPatchSizeMethod
 from daemon.scans.verify_random_patterns import VerifyRandomPatternsMethod
 from protocol.scans import (
+    Advise,
     AnyScan,
     CalibrateDark,
     CalibrateLatency,
@@ -59,6 +61,7 @@ _METHODS: dict[type[AnyScan], type[Method[Any]]] = {
     CalibrateLeak: LeakMethod,
     CalibrateTone: ToneMethod,
     CalibrateLatency: LatencyMethod,
+    Advise: AdviseMethod,
     VerifyPatchSize: VerifyPatchSizeMethod,
     VerifyRandomPatterns: VerifyRandomPatternsMethod,
     VerifyLitFraction: VerifyLitFractionMethod,

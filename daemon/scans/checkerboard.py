@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daemon import patterns
 from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import RankedMethod
 from daemon.separation.estimator import Estimator
+from daemon.separation.handedness import shift_weights
 from protocol.patterns import Checker
 from protocol.scans import Checkerboard
 
@@ -22,9 +24,8 @@ class CheckerboardMethod(RankedMethod[Checkerboard]):
     def __init__(self, spec: Checkerboard, bench: Bench) -> None:
         _check_coverage(spec)
         offsets = [spec.shift * n for n in range(spec.shifts)]
-        shifted = [
-            Checker(size=spec.checker, shift_x=x, shift_y=y) for y in offsets for x in offsets
-        ]
+        self._shifts = [(x, y) for y in offsets for x in offsets]
+        shifted = [Checker(size=spec.checker, shift_x=x, shift_y=y) for x, y in self._shifts]
         super().__init__(spec, bench, shifted)
 
     def described(self) -> str:
@@ -34,6 +35,10 @@ class CheckerboardMethod(RankedMethod[Checkerboard]):
     def counted(self) -> str:
         """See `PatternMethod`."""
         return f"{super().counted()} (set --shifts)"
+
+    def weights(self) -> NDArray[np.complex128] | None:
+        """See `RankedMethod`."""
+        return shift_weights(self._shifts, 2.0 * self.spec.checker)
 
     def estimator(self) -> Estimator:
         """See `Method`."""

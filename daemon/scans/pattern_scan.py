@@ -183,6 +183,10 @@ class RankedMethod(PatternMethod[P]):
 
     estimators = ("topk", "maxmin")
 
+    def weights(self) -> NDArray[np.complex128] | None:
+        """What tells the pattern's place at a pixel: see `handedness.WaveSums`. None: nothing."""
+        return None
+
     def ranking(self) -> Estimator:
         """The paper's max/min where it is asked for, or where there are too few patterns to rank;
         else topk."""
@@ -205,4 +209,5 @@ class RankedMethod(PatternMethod[P]):
             leakage=self.leakage,
             levels=self.levels,
             average=self.spec.average,
+            weights=self.weights(),
         )

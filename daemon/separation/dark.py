@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Curve, Measurement, NotYet, Observation, Plot
-from daemon.separation.sampling import Moments, Plane, line
+from daemon.separation.sampling import Moments, Plane, Turns, line
 
 _HOT = 8.0
 """A hot pixel is above its neighbours by so many standard deviations of its mean, and ..."""
@@ -31,23 +31,32 @@ class Dark:
         self._exposures = exposures
         self._step = 2 if bayer else 1
         self._open = Moments()
+        self._turns = Turns()
+        self._exposure_us = 0.0
         self._points: list[tuple[float, float, float]] = []  # exposure in µs, level, variance
         self._longest: tuple[float, Plane, float] | None = None  # and the deviation of its mean
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Estimator`."""
+        if self._turns.overdue(observation) is not None:
+            self._close()
+        self._exposure_us = observation.exposure_us
         if observation.used:
             self._open.add(pixels)
-        if observation.last and self._open.frames > 1:
+        if observation.last:
+            self._close()
+
+    def _close(self) -> None:
+        if self._open.frames > 1:
             mean, variance = self._open.mean(), self._open.variance()
             usual = np.abs(mean - np.median(mean)) <= 8 * _robust(mean)
             level = float(mean[usual].mean(dtype=np.float64))
             spread = float(variance[usual].mean(dtype=np.float64))
-            self._points.append((observation.exposure_us, level, spread))
+            self._points.append((self._exposure_us, level, spread))
             deviation = (spread / self._open.frames) ** 0.5
-            if self._longest is None or observation.exposure_us >= self._longest[0]:
-                self._longest = observation.exposure_us, mean, deviation
-            self._open = Moments()
+            if self._longest is None or self._exposure_us >= self._longest[0]:
+                self._longest = self._exposure_us, mean, deviation
+        self._open = Moments()
 
     def result(self) -> Measurement:
         """See `Estimator`. Raises NotYet before the last exposure is in."""

@@ -19,6 +19,31 @@ SIGNIFICANT = 3.0
 DEVIATIONS = frozenset({"direct_std", "global_std"})
 """Planes that have a component's shape."""
 
+ADVICE: dict[Quality, tuple[float, str]] = {
+    Quality.SATURATED: (
+        0.005,
+        "of the pixels are saturated, and their components too small: expose more briefly "
+        "(--exposure) or lower the gain",
+    ),
+    Quality.NEGATIVE: (
+        0.02,
+        "of the pixels have a component below zero by more than noise: the leakage (--leakage), "
+        "the black level (--black), a tone curve (--tone, `umbra calibrate tone`) or the lit "
+        "fraction is not the one given; black and white frames would tell which",
+    ),
+    Quality.RESIDUE: (
+        0.002,
+        "of the pixels see the pattern by way of a mirror or of glass, and what they reflect "
+        "counts as direct: don't trust them, or cover or powder the mirror",
+    ),
+    Quality.MOVED: (
+        0.005,
+        "of the pixels changed between the black and white frames and the patterns: keep scene "
+        "and camera still, and scan again",
+    ),
+}
+"""What to do where more than a part of the pixels has a bit: the part, and words."""
+
 _BINS = 64
 
 
@@ -73,14 +98,16 @@ def finish(
             planes[name] = mosaic.demosaic(planes[name], response.bayer)
         direct[unknown] = np.nan
         indirect[unknown] = np.nan
+    counted = count(quality)
     figures = {
         **facts,
+        "advice": [*facts.get("advice", ()), *_advice(counted)],
         "noise_counts": round(float(np.nanmedian(judgement.deviation)), 4),
         "black_level": response.black,
         "tone": response.tone,
         "full_scale": response.full_scale,
         "saturated_from": response.saturated_from,
-        "quality": count(quality),
+        "quality": counted,
         "exposure_histogram": histogram(brightest, response.linear_full_scale),
     }
     return Components(direct, indirect, quality, planes, figures)
@@ -129,6 +156,15 @@ def count(quality: NDArray[np.uint16]) -> dict[str, dict[str, float]]:
         name = (flag.name or "").lower()
         found[name] = {"pixels": pixels, "fraction": round(pixels / quality.size, 6)}
     return found
+
+
+def _advice(counted: dict[str, dict[str, float]]) -> list[str]:
+    lines = []
+    for flag, (least, words) in ADVICE.items():
+        part = counted[(flag.name or "").lower()]["fraction"]
+        if part > least:
+            lines.append(f"{part:.1%} {words}")
+    return lines
 
 
 def histogram(light: Plane, full_scale: float) -> dict[str, Any]:

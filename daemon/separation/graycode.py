@@ -20,6 +20,7 @@ from daemon.separation.finish import SIGNIFICANT, Judgement, finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
+from daemon.separation.steadiness import compare
 
 FINE = 4
 """Bits whose stripes count as high frequency: 2, 4, 8 and 16 px wide."""
@@ -128,7 +129,9 @@ class GrayCodeDecoder:
         contrast, stripe = self._finest(deviation)
         direct = contrast * np.float32(1.0 / (1.0 - b))
         pair = self._whole * np.float32(1.0 / self._pairs)
-        total = self._references.total(pair * np.float32(0.5), b)
+        half: Plane = pair * np.float32(0.5)
+        total = self._references.total(half, b)
+        moved, steady, advice = compare(self._references, half, deviation, b)
         indirect: Plane = total.light - direct
         direct_std = deviation * np.float32(np.sqrt(2.0) / (1.0 - b))
         share = total.of_half * 0.5 / self._pairs + total.of_frame * self._average
@@ -152,6 +155,7 @@ class GrayCodeDecoder:
                 total=np.float32(SIGNIFICANT) * global_std,
                 deviation=deviation,
             ),
+            flags=moved,
             planes=planes,
             facts={
                 "estimator": "finest stripes",
@@ -165,6 +169,8 @@ class GrayCodeDecoder:
                     for width in np.unique(stripe).tolist()
                 },
                 **self._references.facts(total.source),
+                **steady,
+                "advice": advice,
             },
         )
 

@@ -83,8 +83,12 @@ class Latency:
             spread = float(told.std(ddof=1)) if told.size > 1 else float("nan")
             how = f"{told.size} frames that saw the change"
         elif parts.min() >= 1 - _PARTLY:
-            mean, spread = 0.0, 0.0
-            how = "no frame saw the change: the light is there when the driver says so"
+            # It changed before the first frame: to wait for as long as that one did is enough.
+            mean, spread = max(0.0, float(delays.min())), 0.0
+            how = (
+                "no frame saw the change: it came before the first exposure, "
+                f"{mean / 1e3:.3g} ms after the driver's moment"
+            )
         else:
             raise NotYet(
                 f"no flash was seen within {self._longest_us / 1e3:g} ms: is the camera looking "

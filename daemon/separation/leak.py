@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.contrast import CheckerContrast
 from daemon.separation.estimator import (
     Curve,
     Lighting,
@@ -16,7 +17,7 @@ from daemon.separation.estimator import (
     Plot,
 )
 from daemon.separation.radiometry import FrameMean, Plane, Response
-from daemon.separation.sampling import Mask, bright, median_ratio, ratio
+from daemon.separation.sampling import Mask, Turns, bright, median_ratio, ratio
 
 _RESOLVED = 0.5
 """A size whose contrast is less than this part of the largest's is not resolved."""
@@ -45,10 +46,8 @@ class Leak:
         self._sizes = sizes
         self._ends = np.cumsum(images)
         self._references = {kind: FrameMean(response) for kind in Lighting}
-        self._halves = (FrameMean(response), FrameMean(response))
-        self._taken = 0
-        self._shown: tuple[Plane, Plane] | None = None  # a pattern, until its complement comes
-        self._best: tuple[Plane, Plane] | None = None
+        self._turns = Turns()
+        self._pairs = CheckerContrast(response)
         self._saturated: Mask | None = None
         self._good: Mask | None = None
         self._largest: Plane | None = None
@@ -64,43 +63,20 @@ class Leak:
                     known = self._saturated
                     self._saturated = saturated if known is None else known | saturated
             return
+        if (overdue := self._turns.overdue(observation)) is not None:
+            self._end(overdue)
         if observation.used:
-            self._halves[self._taken % 2].add(pixels)
-            self._taken += 1
+            self._pairs.add(pixels)
         if observation.last:
-            self._pattern(observation.pattern)
+            self._end(observation.pattern)
 
-    def _pattern(self, pattern: int) -> None:
-        first, second = self._halves
-        if self._taken:
-            choosing = first.value()
-            measuring = second.value() if second.frames else choosing
-            if self._shown is None:
-                self._shown = choosing, measuring
-            else:
-                self._compare(self._shown[0] - choosing, self._shown[1] - measuring)
-                self._shown = None
-        first.clear()
-        second.clear()
-        self._taken = 0
+    def _end(self, pattern: int) -> None:
+        self._pairs.end_of_pattern()
         if pattern + 1 in self._ends:
-            self._close(int(np.searchsorted(self._ends, pattern, side="right")))
+            number = int(np.searchsorted(self._ends, pattern, side="right"))
+            self._close(number, self._pairs.take())
 
-    def _compare(self, choosing: Plane, measuring: Plane) -> None:
-        """Keep the pair with the greatest contrast, chosen by one half of the frames and measured
-        by the other: else noise would choose, and be measured with the light."""
-        size, contrast = np.abs(choosing), np.sign(choosing) * measuring
-        if self._best is not None:
-            better = size > self._best[0]
-            size = np.where(better, size, self._best[0])
-            contrast = np.where(better, contrast, self._best[1])
-        self._best = size, contrast
-
-    def _close(self, number: int) -> None:
-        if self._best is None:
-            raise ValueError("a size has come to its end without a pattern and its complement")
-        contrast = self._best[1]
-        self._best = None
+    def _close(self, number: int, contrast: Plane) -> None:
         if self._largest is None:
             ambient, white = self._ambient(), self._references[Lighting.WHITE].value()
             if self._saturated is None:

@@ -13,9 +13,7 @@ from daemon.separation.finish import Judgement, finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
-
-_RESIDUAL = 0.02
-"""Part of the light by which a pattern and its complement may miss black and white together."""
+from daemon.separation.steadiness import compare
 
 
 class ComplementPair:
@@ -64,6 +62,9 @@ class ComplementPair:
         lit, unlit = (first, second) if ambient is None else (first - ambient, second - ambient)
         brightest = np.maximum(first, second)
         deviation = self._noise.deviation(brightest)
+        moved, steady, advice = compare(
+            self._references, (first + second) * np.float32(0.5), deviation, self._leakage
+        )
         direct, indirect = light_model.from_complement_pair(lit, unlit, self._alpha, self._leakage)
         return finish(
             direct,
@@ -71,6 +72,7 @@ class ComplementPair:
             response=self._response,
             brightest=brightest,
             saturated=self._saturated,
+            flags=moved,
             planes=self._deviations(deviation),
             judgement=Judgement.of_extremes(deviation, 2),
             facts={
@@ -81,7 +83,9 @@ class ComplementPair:
                 "leakage": self._leakage,
                 "noise_from": self._noise.source,
                 **self._references.facts(source),
+                **steady,
                 **self._residual(first, second),
+                "advice": advice,
             },
         )
 
@@ -126,13 +130,6 @@ class ComplementPair:
         found = round(float(np.median(residual)), 5)
         return {
             "complement_residual": found,
-            "advice": [
-                f"the two images together have {found:+.1%} of the light of black and white "
-                "together: the camera's tone curve is not the one given, or the source changed; "
-                "give the curve with --tone"
-            ]
-            if abs(found) > _RESIDUAL
-            else [],
         }
 
     def summary(self) -> dict[str, float]:

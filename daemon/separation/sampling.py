@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.estimator import NotYet
+from daemon.separation.estimator import NotYet, Observation
 
 Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -47,6 +47,20 @@ class Moments:
             raise NotYet("a variance takes two frames")
         spread = self._squares - self._sum * self._sum / self.frames
         return np.maximum(spread / (self.frames - 1), 0.0).astype(np.float32)
+
+
+class Turns:
+    """When a pattern's frames have all come: with its last, or, where that one is missing, when
+    another pattern's first comes."""
+
+    def __init__(self) -> None:
+        self._open: int | None = None
+
+    def overdue(self, observation: Observation) -> int | None:
+        """The pattern before this observation's whose last frame never came, if there is one."""
+        before, same = self._open, observation.pattern
+        self._open = None if observation.last else same
+        return None if before == same else before
 
 
 def bright(black: Plane, white: Plane, saturated: Mask) -> Mask:

@@ -94,6 +94,12 @@ class ResidualNoise:
             return None
         return fitted.typical / self._picture.typical
 
+    @property
+    def distortion(self) -> float | None:
+        """What the fit leaves over the wave's amplitude, where that is large: the median."""
+        found = [r.distortion() for r in self._frequencies.values() if r.freedom > 0]
+        return max(found) if found else None
+
     def noise(self) -> Noise | None:
         """Deviation of one frame's counts by level."""
         return self._fitted() or self._picture
@@ -160,3 +166,15 @@ class _Residuals:
         left = self._squares - np.einsum("k...,k...->...", fitted, self._sums)
         variance = np.maximum(left, 0.0) / self.freedom
         return fitted[0].astype(np.float32), variance.astype(np.float32)
+
+    def distortion(self) -> float:
+        """Root mean square of what the fit leaves over the wave's amplitude: the median over the
+        brighter half of the wave."""
+        assert self._sums is not None
+        _, cosine, sine = np.tensordot(np.linalg.inv(self._normal), self._sums, axes=1)
+        amplitude = np.hypot(cosine, sine)
+        large = (amplitude >= np.median(amplitude)) & (amplitude > 0)
+        if not large.any():
+            return 0.0
+        _, variance = self.variance()
+        return float(np.median(np.sqrt(variance[large]) / amplitude[large]))

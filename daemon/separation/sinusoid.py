@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from daemon.separation import correspondence
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
+from daemon.separation.handedness import reversed_pattern, strength
 from daemon.separation.noise import Noise
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ResidualNoise
+from daemon.separation.steadiness import compare
 
 _LEAST_ECCENTRIC = 0.02
 """Least ratio of the fit's eigenvalues: phases that nearly coincide don't tell M, B, φ apart."""
@@ -33,7 +35,10 @@ _DISAGREE_PART = 0.1
 
 _MISFIT = 5.0
 """So far above a picture's noise, what the fit leaves is not noise."""
-_MEAN_OFF = 0.03
+_DOUBTFUL = 2.0
+"""Above this it is none where it is also a part of the wave: ..."""
+_DISTORTED = 0.05
+_MANY = 0.2  # of the pixels
 
 
 class LeastSquares:
@@ -102,13 +107,21 @@ class LeastSquares:
         quality = np.zeros(direct.shape[:2], dtype=np.uint16)
         if len(solved) > 1:
             quality |= bits(_disagree(solved), Quality.DISAGREE)
+        if self._periods:
+            quality |= bits(self._mirrored(ready[0], noise), Quality.RESIDUE)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": np.sqrt(direct_var),
             "global_std": np.sqrt(global_var),
         }
         planes.update(self._correspondence(ready))
-        ratio = self._mean_ratio(ready[0])
+        mean = np.add.reduce([fit.solve()[0] for fit in ready]) * np.float32(1.0 / len(ready))
+        moved, steady, advice = compare(
+            self._references, mean, self._level(ready[0], noise), self._leakage
+        )
+        if moved is not None:
+            quality |= moved
         misfit = self._noise.misfit
+        disagreeing = float(np.mean((quality & np.uint16(Quality.DISAGREE)) != 0))
         facts: dict[str, Any] = {
             "estimator": "lsq",
             "patterns": sum(fit.frames for fit in self._fits),
@@ -121,9 +134,10 @@ class LeastSquares:
             **self._references.facts(
                 self._references.total(ready[0].solve()[0], self._leakage).source
             ),
-            **ratio,
+            "mirrors_looked_for": bool(self._periods),
+            **steady,
             "misfit": None if misfit is None else round(misfit, 3),
-            "advice": _advice(ratio, misfit),
+            "advice": _advice(misfit, self._noise.distortion, disagreeing) + advice,
         }
         return finish(
             direct,
@@ -204,20 +218,18 @@ class LeastSquares:
         total_var: Plane = variance * np.float32(mean_var * total.of_half + total.of_frame)
         return direct, indirect, direct_var, direct_var + total_var
 
+    def _mirrored(self, fit: _Fit, noise: Noise | None) -> NDArray[np.bool_]:
+        """Where the phase runs against the picture's."""
+        _, cosine, sine = fit.solve()
+        wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
+        if wave.ndim == 3:
+            wave = np.asarray(wave.sum(axis=2), dtype=np.complex64)
+        deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
+        return reversed_pattern([wave], strength([wave], deviation))
+
     def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
         mean, _, _ = fit.solve()
         return self._response.deviation(noise, self._response.counts(mean))
-
-    def _mean_ratio(self, fit: _Fit) -> dict[str, float]:
-        """Median of M/½(W + K): 1 where the projector's tone curve is linear."""
-        black = self._references.mean(Lighting.BLACK)
-        white = self._references.mean(Lighting.WHITE)
-        if black is None or white is None:
-            return {}
-        half = (white + black) * np.float32(0.5)
-        bright = half > 0.1 * float(np.quantile(half, 0.99))
-        mean = fit.solve()[0]
-        return {"mean_ratio": round(float(np.median(mean[bright] / half[bright])), 4)}
 
     def _correspondence(self, ready: list[_Fit]) -> dict[str, NDArray[Any]]:
         """Wrapped phase of the first frequency, and where the projector lit each pixel."""
@@ -307,20 +319,21 @@ def _disagree(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> NDArray[np.boo
     return differ if differ.ndim == 2 else np.asarray(np.logical_or.reduce(differ, axis=2))
 
 
-def _advice(ratio: dict[str, float], misfit: float | None) -> list[str]:
+def _advice(misfit: float | None, distortion: float | None, disagreeing: float) -> list[str]:
     """What to do about frames that are no sinusoids in time; [] where they are."""
     lines = []
-    if misfit is not None and misfit > _MISFIT:
+    if misfit is not None and (
+        misfit > _MISFIT or (misfit > _DOUBTFUL and (distortion or 0.0) > _DISTORTED)
+    ):
         lines.append(
             f"the frames are {misfit:.0f} times further from a sinusoid than noise takes them: "
             "they are not the phases that were declared (--phases, --periods), the tone curve is "
             "not linear, or something moved"
         )
-    found = ratio.get("mean_ratio")
-    if found is not None and abs(found - 1.0) >= _MEAN_OFF:
+    if disagreeing > _MANY:
         lines.append(
-            f"the mean over the phases is {found:.2f} of half the light, not 1: the projector's or "
-            "the camera's tone curve is not linear, and global is wrong by as much: run `umbra "
-            "calibrate tone`, or give the camera's curve with --tone"
+            f"the periods give different direct light in {disagreeing:.0%} of the pixels: the "
+            "frames are not the phases and periods that were declared (--phases, --periods), or "
+            "the coarser patterns are too coarse for this scene"
         )
     return lines

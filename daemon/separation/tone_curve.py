@@ -16,7 +16,7 @@ from daemon.separation.estimator import (
     Plot,
 )
 from daemon.separation.radiometry import FrameMean, Plane, Response
-from daemon.separation.sampling import Mask, bright, ratio
+from daemon.separation.sampling import Mask, Turns, bright, ratio
 
 _LEVELS = 255
 _DRIFT = 0.02
@@ -34,6 +34,7 @@ class ToneCurve:
         self._levels = levels
         self._white, self._black = FrameMean(response), FrameMean(response)
         self._mean = FrameMean(response)
+        self._turns = Turns()
         self._saturated: Mask | None = None
         self._planes: tuple[Plane, Plane, Mask] | None = None
         self._found: dict[int, tuple[float, float]] = {}
@@ -51,12 +52,16 @@ class ToneCurve:
             if observation.used:
                 self._black.add(pixels)
         else:
+            if (overdue := self._turns.overdue(observation)) is not None:
+                self._close(overdue)
             if observation.used:
                 self._mean.add(pixels)
-            if observation.last and self._mean.frames:
+            if observation.last:
                 self._close(observation.pattern)
 
     def _close(self, pattern: int) -> None:
+        if not self._mean.frames:
+            return
         if self._planes is None:
             if self._saturated is None:
                 raise ValueError("levels are measured against black and white, which come first")

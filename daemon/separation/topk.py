@@ -15,18 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import light_model
-from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import SIGNIFICANT, Judgement, finish
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
+from daemon.separation.handedness import WaveSums, imbalance, reversed_pattern, strength
 from daemon.separation.noise import Noise
 from daemon.separation.order import Ranked
 from daemon.separation.order_model import BLURS, RATIOS, OrderErrors, fit, simulate
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
+from daemon.separation.steadiness import compare
 
 KEEP = 5
 """Samples kept at each end; a checkerboard's 25 shifts light every pixel wholly in 9 or more."""
 
+_UNLIKE = 0.1
+"""Imbalance of a checkerboard's waves from which the frames are not its shifts."""
+
+_HALF = 0.02  # lit fractions so near to a half are one
 _GROUPS = 8
 _FINE = 64  # steps between tabulated ratios
 _TINY = np.float32(1e-6)
@@ -37,7 +43,8 @@ class TopK:
     """Means of the brightest and darkest samples, less what noise and blur do -> direct, global.
 
     `levels(blur)` gives the levels of the pattern set for `order_model.simulate`. Planes:
-    `direct_std`, `global_std`. An update is 18 in-place maxima and minima.
+    `direct_std`, `global_std`. An update is 18 in-place maxima and minima; with `weights` (of
+    `handedness.WaveSums`), by which a mirror is found, 4 products and sums more.
     """
 
     def __init__(
@@ -48,6 +55,7 @@ class TopK:
         leakage: float,
         levels: Callable[[float], Plane],
         average: int = 1,
+        weights: NDArray[np.complex128] | None = None,
     ) -> None:
         self._response = response
         self._alpha = lit_fraction
@@ -60,6 +68,7 @@ class TopK:
         self._low = Ranked(KEEP, largest=False)
         self._high = Ranked(KEEP, largest=True)
         self._saturated: NDArray[np.bool_] | None = None
+        self._waves = None if weights is None else WaveSums(weights)
         self._models = simulate(levels, KEEP)
         self._unused = 0
 
@@ -75,7 +84,7 @@ class TopK:
         elif self._mean is None:
             if self._low.frames == 0:
                 self._noise.add(pixels, observation.pattern)
-            self._rank(pixels)
+            self._rank(pixels, observation.pattern)
         else:
             if self._open is not None and self._open != observation.pattern:
                 self._close(self._mean)
@@ -88,14 +97,16 @@ class TopK:
             self._close(self._mean)
 
     def _close(self, mean: FrameMean) -> None:
-        if mean.frames:
-            self._rank(mean.value())
+        if mean.frames and self._open is not None:
+            self._rank(mean.value(), self._open)
         mean.clear()
         self._open = None
 
-    def _rank(self, samples: NDArray[Any]) -> None:
+    def _rank(self, samples: NDArray[Any], pattern: int) -> None:
         self._low.add(samples)
         self._high.add(samples)
+        if self._waves is not None:
+            self._waves.add(samples, pattern)
 
     def result(self) -> Components:
         """See `Estimator`. Raises NotYet before two patterns are in; with fewer than two ranks of
@@ -121,6 +132,12 @@ class TopK:
         rounding = self._response.deviation(None, self._response.counts(high[0]))
         b = self._leakage
         g = light_model.global_weight(self._alpha, b)
+        moved: NDArray[np.uint16] | None = None
+        steady: dict[str, Any] = {}
+        advice: list[str] = []
+        if abs(self._alpha - 0.5) < _HALF:
+            middle = (lit + unlit) * np.float32(0.5)
+            moved, steady, advice = compare(self._references, middle, deviation, b)
         ambient, source = self._references.ambient(lit, unlit, self._alpha, b)
         if ambient is not None:
             lit, unlit = lit - ambient, unlit - ambient
@@ -149,12 +166,17 @@ class TopK:
         saturated = self._saturated
         if saturated is None:
             saturated = self._high.planes[0] >= self._response.saturated_from
+        mirrored, told, wrong = self._mirrored(deviation)
+        flags = np.zeros(direct.shape[:2], dtype=np.uint16) if moved is None else moved
+        if mirrored is not None:
+            flags |= bits(mirrored, Quality.RESIDUE)
         return finish(
             direct,
             indirect,
             response=self._response,
             brightest=high[0],
             saturated=saturated,
+            flags=flags,
             judgement=Judgement(
                 direct=np.float32(SIGNIFICANT) * np.maximum(planes["direct_std"], rounding),
                 total=np.float32(SIGNIFICANT) * np.maximum(planes["global_std"], rounding),
@@ -173,8 +195,36 @@ class TopK:
                     for ratio, k in zip(RATIOS, () if model is None else model.k, strict=False)
                 },
                 "noise_from": "repeated frames" if self._noise.measured else "ranks",
+                **told,
+                **steady,
+                "advice": wrong + advice,
                 **self._references.facts(source),
             },
+        )
+
+    def _mirrored(
+        self, deviation: Plane
+    ) -> tuple[NDArray[np.bool_] | None, dict[str, Any], list[str]]:
+        """Where the pattern lies the wrong way round (None where the scan cannot tell), and whether
+        it is the pattern that was declared: facts and advice."""
+        waves = None if self._waves is None else self._waves.waves()
+        if self._waves is None or waves is None:
+            return None, {"mirrors_looked_for": False}, []
+        # ranks hold counts, averages light: near enough for a limit
+        strong = strength(waves, deviation * self._waves.gain)
+        unlike = imbalance(waves, strong)
+        if unlike is None or unlike <= _UNLIKE:
+            misfit = None if unlike is None else round(unlike, 4)
+            facts = {"mirrors_looked_for": True, "pattern_misfit": misfit}
+            return reversed_pattern(waves, strong), facts, []
+        return (
+            None,
+            {"mirrors_looked_for": False, "pattern_misfit": round(unlike, 4)},
+            [
+                "the frames are not the shifts of a checkerboard that were declared, in their "
+                "order (--checker, --shift, --shifts), or something moved: see that the folder "
+                "holds this scan alone, and that its names sort in the order of the shifts"
+            ],
         )
 
     def _light(self, samples: NDArray[Any]) -> Plane:

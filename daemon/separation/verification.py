@@ -23,6 +23,7 @@ from daemon import patterns
 from daemon.separation.estimator import Lighting, Measurement, NotYet, Observation
 from daemon.separation.graycode import Coded, GrayCodeDecoder
 from daemon.separation.radiometry import FrameMean, Plane, Response
+from daemon.separation.sampling import Turns
 from protocol.patterns import AnyPattern
 
 REACH = 8
@@ -113,6 +114,8 @@ class Verification:
         self._decoder = GrayCodeDecoder(self._response, images=images, leakage=0.0)
         self._references = {kind: FrameMean(self._response) for kind in Lighting}
         self._mean = FrameMean(self._response)
+        self._turns = Turns()
+        self._shape: tuple[int, ...] = ()  # of a frame
         self._sums: list[list[float]] = [[] for _ in spots]
         self._variances: list[list[float]] = [[] for _ in spots]
         self._saturated = np.zeros(len(self._spots), dtype=np.bool_)
@@ -124,10 +127,16 @@ class Verification:
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Estimator`."""
-        if not observation.used:
-            if observation.last and self._mean.frames:
-                self._close(observation.pattern)
-            return
+        patterned = observation.lighting is Lighting.PATTERN
+        overdue = self._turns.overdue(observation) if patterned else None
+        if overdue is not None:
+            self._end(overdue)
+        if observation.used:
+            self._take(pixels, observation)
+        if patterned and observation.last:
+            self._end(observation.pattern)
+
+    def _take(self, pixels: NDArray[Any], observation: Observation) -> None:
         windows = np.concatenate([self._window(pixels, spot) for spot in self._spots])
         if observation.lighting is not Lighting.PATTERN:
             self._references[observation.lighting].add(windows)
@@ -136,24 +145,27 @@ class Verification:
                     middle = _cut(windows, k)[REACH - 1 : REACH + 2, REACH - 1 : REACH + 2]
                     self._saturated[k] |= bool((middle >= self._response.saturated_from).any())
         elif observation.pattern < self._images:
+            self._shape = pixels.shape
             self._decoder.update(windows, observation)
-            if observation.pattern == self._images - 1 and observation.last:
-                self._locate(pixels)
         else:
             self._mean.add(windows)
             self._note(windows)
-            if observation.last:
-                self._close(observation.pattern)
+
+    def _end(self, pattern: int) -> None:
+        if pattern == self._images - 1:
+            self._locate()
+        elif pattern >= self._images and self._mean.frames:
+            self._close(pattern)
 
     def _window(self, pixels: NDArray[Any], spot: Spot) -> NDArray[Any]:
         cut = pixels[spot.y - REACH : spot.y + REACH + 1, spot.x - REACH : spot.x + REACH + 1]
         return cut[..., 1] if cut.ndim == 3 else cut  # the paper measures in the green channel
 
-    def _locate(self, pixels: NDArray[Any]) -> None:
+    def _locate(self) -> None:
         planes = self._decoder.result().planes
         places = []
         for k, spot in enumerate(self._spots):
-            green = _green(self._bayer, spot, pixels.shape)
+            green = _green(self._bayer, spot, self._shape)
             column, row = _cut(planes["column"], k), _cut(planes["row"], k)
             reach_px = _NEAR_BLURRED_PX if self._source.blur_px else _NEAR_PX
             try:

@@ -25,6 +25,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "calibrate": ("scan:calibrate", "Calibrate the rig: dark, noise, leak, tone, latency."),
         "verify": ("scan:verify", "Verify the separation at points, as the paper does (3.5)."),
         "plan": ("plan:app", "Work out radius, feed and frames of a mesh scan; no rig needed."),
+        "advise": ("scan:advise", "Which pattern, images and exposure this scene needs."),
         "watch": ("watch:watch", "Follow a run: progress, rate, time left."),
         "runs": ("runs:runs", "List runs, the newest first."),
         "run": ("runs:run", "One run in detail."),
@@ -45,7 +46,10 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "keys": ("keys:app", "Make, authorise, list and revoke CURVE keys."),
     },
     "By hand": {
-        "preview": ("hand:preview", "The latest frame, in the terminal or as a picture."),
+        "preview": (
+            "preview:preview",
+            "Look through the camera, once or live.",
+        ),
         "show": ("show:app", "Project a pattern: white, black, off, checker ..."),
         "snap": ("hand:snap", "Take one frame and save it as PNG."),
         "camera": ("hand:camera", "Read or change the camera's settings."),

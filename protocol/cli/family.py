@@ -70,7 +70,7 @@ class Family(TyperGroup):
         if cmd_name in self.more:
             return command_of(cmd_name, self.more[cmd_name])
         struct = self._structs().get(cmd_name)
-        return command_of(cmd_name, _command(struct, type(self).act)) if struct else None
+        return command_of(cmd_name, command_for(struct, type(self).act)) if struct else None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """As typer does, with names to suggest that are not made yet."""
@@ -86,7 +86,8 @@ class Family(TyperGroup):
             formatter.write_dl(rows)
 
 
-def _command(struct: type[msgspec.Struct], act: Callable[..., Any]) -> Callable[..., Any]:
+def command_for(struct: type[msgspec.Struct], act: Callable[..., Any]) -> Callable[..., Any]:
+    """A command whose options are a struct's fields, and which hands the struct to `act`."""
     options = options_of(struct)
     names = {option.name for option in options}
     takes = next(iter(inspect.signature(act).parameters))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Sequence
-from typing import Annotated, Any
+import time
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,6 +23,11 @@ from protocol.cli.output import (
 from protocol.cli.words import frames, method
 from protocol.errors import Code, UmbraError
 from protocol.messages import DeviceInfo, Devices, Discovered, Done, Log, Search, Status
+
+if TYPE_CHECKING:
+    from protocol.client import Client
+
+_FOLLOW_S = 1.0
 
 
 def status(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
@@ -55,7 +62,8 @@ def _status_lines(now: Status, server: str) -> list[tuple[str, str]]:
     lines.append(("queue", f"{len(now.queue)} waiting" if now.queue else "empty"))
     if now.lock is not None:
         note = f" ({now.lock.note})" if now.lock.note else ""
-        lines.append(("lock", f"held by {now.lock.owner}{note}"))
+        left = f", {seconds(now.lock.remaining_s)} unless renewed"
+        lines.append(("lock", f"held by {now.lock.owner}{note}{left}"))
     lines.append(
         ("disk", f"{size(now.free_bytes)} free, {size(now.reserve_bytes)} kept in reserve")
     )
@@ -159,21 +167,50 @@ def log(
         int, typer.Option("-n", "--limit", min=1, max=10_000, help="How many records.")
     ] = 50,
     daemon: Annotated[bool, typer.Option("--daemon", help="The daemon's own log.")] = False,
+    follow: Annotated[
+        bool, typer.Option("-f", "--follow", help="And those that come, until Ctrl-C.")
+    ] = False,
     rig: Rig = None,
     keys: Keys = None,
     as_json: Json = False,
 ) -> None:
     """The last log records of a run, the oldest first; without RUN or with --daemon, the daemon's.
 
-    --json: a Log.
+    The daemon keeps the last 5000 since its start; its journal (journalctl -u umbrad) has them all.
+
+    --json: a Log; with --follow a record a line.
     """
+    of = "" if daemon else run
     with connect(rig, keys) as client:
-        records = client.log("" if daemon else run, limit)
+        if follow:
+            with contextlib.suppress(KeyboardInterrupt):
+                for record in _followed(client, of, limit):
+                    if as_json:
+                        print_json(record, lines=True)
+                    else:
+                        print(log_line(record), flush=True)
+            return
+        records = client.log(of, limit)
     if as_json:
         print_json(Log(records=records))
         return
     for record in records:
         print(log_line(record))
+    if not records:
+        say("no records since umbrad's start; its journal goes further: journalctl -u umbrad")
+
+
+def _followed(client: Client, run: str, limit: int) -> Iterator[dict[str, Any]]:
+    """The last records, then those that come: asked for each second, told from the old by all that
+    they say, their time included."""
+    last: dict[str, Any] | None = None
+    while True:
+        records = client.log(run, limit)
+        places = [i for i, record in enumerate(records) if record == last]
+        yield from records[places[-1] + 1 if places else 0 :]
+        if records:
+            last, limit = records[-1], max(limit, 200)
+        time.sleep(_FOLLOW_S)
 
 
 def log_line(record: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ import msgspec
 import typer
 
 from protocol.cli.delivery import Delivery
-from protocol.cli.family import Family
+from protocol.cli.family import Family, command_for
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.options import with_options
 from protocol.cli.output import print_json, say
@@ -22,7 +22,7 @@ from protocol.cli.watch import conclude, follow, goes_on
 from protocol.cli.words import Fetched
 from protocol.errors import Code, UmbraError
 from protocol.messages import Run
-from protocol.scans import AnyCalibration, AnyScan, AnySeparation, AnyVerification
+from protocol.scans import Advise, AnyCalibration, AnyScan, AnySeparation, AnyVerification
 
 
 def scan(
@@ -185,3 +185,6 @@ def _verify(context: typer.Context, rig: Rig = None, keys: Keys = None) -> None:
     context.obj = {"rig": rig, "keys": keys}
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
+
+
+advise = command_for(Advise, scan)

@@ -42,7 +42,11 @@ def settings(run: RunInfo) -> str:
 
 
 def _plain(value: object) -> str:
-    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    if isinstance(value, msgspec.Struct):  # as an option takes it
+        return ":".join(_plain(part) for part in msgspec.structs.astuple(value) if part != "")
+    if isinstance(value, float):
+        return f"{value:g}"
+    return ",".join(map(_plain, value)) if isinstance(value, tuple) else str(value)
 
 
 def ending(run: RunInfo) -> str:

@@ -151,6 +151,18 @@ def test_tone_finds_a_gamma_and_its_inverse() -> None:
     assert np.abs(light - np.linspace(0, 1, 256)).max() < 0.006  # the projector's own 256 levels
 
 
+def test_a_level_whose_last_frame_is_missing_is_measured_by_the_others() -> None:
+    levels = (0.25, 0.5, 0.75, 1.0)
+    estimator = ToneCurve(RESPONSE, levels)
+    for lighting, level in ((Lighting.WHITE, 1.0), (Lighting.BLACK, 0.0)):
+        estimator.update(shot(SCENE * level), Observation(lighting=lighting))
+    for index, level in enumerate(levels):
+        for sub in range(1 if index == 1 else 2):  # the second of the second level never comes
+            seen = Observation(pattern=index, last=sub == 1)
+            estimator.update(shot(SCENE * level), seen)
+    assert estimator.result().facts["departure_from_linear"] < 0.005
+
+
 def test_a_response_that_is_flat_somewhere_has_an_inverse() -> None:
     levels = np.linspace(0, 1, 5)
     tone = inverted(levels, np.asarray([0.0, 0.3, 0.3, 0.29, 1.0]))
@@ -181,7 +193,7 @@ def test_latency_is_found_with_its_spread() -> None:
 def test_a_projector_that_is_on_time_is_not_waited_for() -> None:
     facts = flashes(0.0).result().facts
     assert facts["values"]["latency_s"] == 0.0
-    assert "when the driver says so" in facts["from"]
+    assert "before the first exposure" in facts["from"]
 
 
 def test_a_flash_that_never_comes_is_said() -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from daemon.devicethread import DeviceThread, Revoked, Session, Stuck
-from drivers.base import Context, DeviceLost, Identity, Light, Options
+from drivers.base import Context, DeviceGarbled, DeviceLost, Identity, Light, Options
 
 
 class Lamp(Light):
@@ -106,3 +106,13 @@ def test_a_call_that_never_comes_back_is_named(
     lamp.device.let_go.set()
     assert lamp.call(lambda _: True, 5)
     assert lamp.alive
+
+
+def test_what_a_driver_should_not_raise_is_a_device_error(lamp: DeviceThread[Lamp]) -> None:
+    def break_down(_: Lamp) -> None:
+        raise OSError(5, "Input/output error")
+
+    with pytest.raises(DeviceGarbled, match="lamp: call: the driver broke: OSError") as caught:
+        lamp.call(break_down, 1)
+    assert isinstance(caught.value.__cause__, OSError)
+    assert lamp.call(lambda _: 7, 1) == 7

@@ -254,6 +254,11 @@ def test_triggers() -> None:
     assert exposing.trigger([shot(began=400, sequence=n) for n in range(3)]).outcome is WARNING
 
 
+def test_a_camera_that_runs_free() -> None:
+    found = exposing.stream([shot(began=40 * n) for n in range(4)])
+    assert (found.outcome, "every 40.0 ms" in found.message) == (WARNING, True)
+
+
 def test_light_and_its_latency() -> None:
     dark, bright = shot(0.02), shot(0.5)
     assert [c.outcome for c in exposing.lit("l", dark, bright)] == [OK]

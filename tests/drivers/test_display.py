@@ -83,6 +83,27 @@ def test_every_pixel_is_on_the_screen_as_it_was_asked_for(
     assert not screenshot(screen).any()
 
 
+def test_nothing_else_is_seen_and_flips_wait(make: Callable[..., Thread]) -> None:
+    """A screenshot has no cursor in it: what SDL was told has to do."""
+    thread = make()
+    thread.call(lambda d: d.connect(), 20)
+    asked = ("mouse.get_visible", "display.get_allow_screensaver", "display.is_vsync")
+
+    def told(_: display.DisplayProjector) -> list[bool]:
+        return [getattr(getattr(pygame, a), b)() for a, b in (name.split(".") for name in asked)]
+
+    assert thread.call(told, 10) == [False, False, True]
+
+
+def test_without_a_gpu_it_says_that_a_timer_paces_flips(
+    make: Callable[..., Thread], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SDL_RENDER_DRIVER", "software")
+    thread = make()
+    thread.call(lambda d: d.connect(), 20)
+    assert thread.device.facts()["flips_by"] == "timer"
+
+
 def test_it_stays_for_as_long_as_nothing_else_is_shown(
     make: Callable[..., Thread], screen: str
 ) -> None:
@@ -135,6 +156,25 @@ def test_flips_tell_when_light_comes(make: Callable[..., Thread]) -> None:
     assert all(b > a for a, b in pairwise(moments))
 
 
+def test_safe_is_over_when_the_light_is_black(make: Callable[..., Thread]) -> None:
+    thread = make(latency_frames=3)
+    thread.call(lambda d: d.connect(), 20)
+    lit = thread.call(lambda d: d.show(noise(HEIGHT, WIDTH)), 10)
+    thread.call(lambda d: d.safe(), 10)
+    assert thread.device.clock.now_ns() > lit
+
+
+def test_halt_ends_the_wait_for_black(make: Callable[..., Thread], screen: str) -> None:
+    thread = make(latency_frames=100_000)
+    thread.call(lambda d: d.connect(), 20)
+    thread.call(lambda d: d.show(noise(HEIGHT, WIDTH)), 10)
+    safe = thread.submit(lambda d: d.safe(), 60)
+    while not safe.done():  # a halt that comes before the call is not remembered
+        thread.device.halt()
+    safe.result()
+    assert not screenshot(screen).any()
+
+
 def test_a_window_to_try_things_in(make: Callable[..., Thread], screen: str) -> None:
     thread = make(windowed=True, size=[200, 100], refresh_hz=100)
     thread.call(lambda d: d.connect(), 20)
@@ -155,7 +195,7 @@ def test_a_window_to_try_things_in(make: Callable[..., Thread], screen: str) -> 
         ({"output": "HDMI-9"}, DeviceLost, "no output 'HDMI-9'"),
         ({"size": [912, 1140]}, DeviceRefused, "is 640 x 480, not 912 x 1140; set the output's"),
         ({"refresh_hz": 400.0}, DeviceRefused, "not at refresh_hz = 400"),
-        ({"video_driver": "dummy"}, DeviceRefused, "dummy driver shows nothing"),
+        ({"video_driver": "dummy"}, DeviceLost, r"no display was found \(its dummy driver"),
         ({"video_driver": "vga"}, DeviceLost, "projector: connect: SDL: .*vga.*DISPLAY"),
     ],
 )
@@ -187,8 +227,9 @@ def test_without_any_display_the_remedy_is_named(
     make: Callable[..., Thread], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("DISPLAY")
-    with pytest.raises((DeviceLost, DeviceRefused), match=r"projector: connect: SDL.*; "):
+    with pytest.raises(DeviceLost, match=r"projector: connect: SDL: .*; set DISPLAY for a desk"):
         make().call(lambda d: d.connect(), 20)
+    assert display.DisplayProjector.discover() == []
 
 
 def test_one_display_a_process(make: Callable[..., Thread]) -> None:

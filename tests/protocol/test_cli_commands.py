@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -464,3 +465,46 @@ def test_keys_from_new_to_revoked(tmp_path: Path, capsys: Captured) -> None:
     assert run(["keys", "revoke", "anna", *place]) == Exit.OK
     assert run(["keys", "revoke", "anna", *place]) == Exit.USAGE
     assert "no key named anna" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------- stage, doctor, devices, log
+
+
+def test_stage_moves_are_asked_for_as_they_are_typed(rig: Rig, capsys: Captured) -> None:
+    assert run(["stage", "circle", "10", "12.5", "3", "--turns", "2", "--feed", "4"]) == Exit.OK
+    circle = asked(rig, m.StageCircle)
+    assert (circle.centre_mm, circle.radius_mm, circle.feed_mm_s) == ((10.0, 12.5), 3.0, 4.0)
+    assert run(["stage", "move", "10", "12"]) == Exit.OK
+    assert asked(rig, m.StageMove).feed_mm_s == 10.0  # half of the fastest
+    assert "1.000, 2.000 mm" in capsys.readouterr().out
+    assert run(["stage", "home", "--timeout", "7"]) == Exit.OK
+    assert asked(rig, m.StageHome).timeout_s == 7.0
+    assert run(["stage", "circle", "1", "2", "3", "--wait"]) == Exit.USAGE  # it has no end
+
+
+def test_the_doctor_exits_as_he_found(rig: Rig, capsys: Captured) -> None:
+    fine = m.Check(name="keys", outcome=m.Outcome.OK, message="good", remedy="")
+    poor = m.Check(name="disk", outcome=m.Outcome.WARNING, message="slow", remedy="buy another")
+    rig.checks = (fine, poor)
+    assert run(["doctor", "--passive"]) == Exit.OK
+    assert asked(rig, m.Examine).passive
+    out = capsys.readouterr().out
+    assert "warning  disk  slow\n               -> buy another\n" in out
+    assert out.endswith("1 ok, 1 warning\n")
+    rig.checks = (fine, msgspec.structs.replace(poor, outcome=m.Outcome.FAILED))
+    assert run(["doctor"]) == Exit.FAILED
+
+
+def test_a_log_that_goes_on(rig: Rig, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    from protocol.cli import rig as module
+
+    records = [{"event": "one", "timestamp": "1"}, {"event": "two", "timestamp": "2"}]
+    rounds = iter([records[:1], records[:1], records])
+
+    class Client:
+        def log(self, run: str, limit: int) -> tuple[dict[str, str], ...]:
+            return tuple(next(rounds))
+
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    followed = module._followed(Client(), "", 50)  # type: ignore[arg-type]
+    assert [next(followed)["event"] for _ in range(2)] == ["one", "two"]

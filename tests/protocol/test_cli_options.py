@@ -13,7 +13,7 @@ from protocol.cli.app import command_of
 from protocol.cli.family import Family, members
 from protocol.cli.options import build, options_of
 from protocol.errors import UmbraError
-from protocol.scans import AnyScan, Checkerboard
+from protocol.scans import AnyScan, Checkerboard, Point, VerifyPatchSize
 
 
 class Mode(enum.StrEnum):
@@ -118,3 +118,12 @@ def test_every_method_of_the_protocol_has_options_with_help(tag: str) -> None:
 
 def test_own_fields_come_first() -> None:
     assert [o.name for o in options_of(Checkerboard)][:3] == ["checker", "shift", "shifts"]
+
+
+def test_a_list_of_structs_is_an_option_given_several_times() -> None:
+    [points] = [o for o in options_of(VerifyPatchSize) if o.name == "points"]
+    assert points.metavar() == "x,y"
+    spec = build(VerifyPatchSize, {"points": ["320,240", "wall=1.5,2"]})
+    assert spec.points == (Point(x=320, y=240), Point(name="wall", x=1.5, y=2))
+    with pytest.raises(UmbraError, match=r"--points: '3' is not \[NAME=\]x,y"):
+        build(VerifyPatchSize, {"points": ["3"]})

@@ -53,7 +53,7 @@ def test_each_command_has_a_method_and_the_answer_it_names(fake: FakeRig, rig: C
     assert rig.pause(run.id) == rig.resume(run.id) == rig.run_info(run.id) == run
     assert rig.abort(run.id).end == m.End(state=m.RunState.ABORTED, reason="aborted by me", by="me")
     assert rig.estop() == rig.reset() == rig.show(WHITE) == rig.light("left", on=True) == ""
-    assert rig.dark() == ""
+    assert rig.dark() == rig.live() == rig.stop_live() == ""
     assert bytes(rig.product_part(run.id, "direct", 1).data) == b"bc"
     assert rig.log() == ({"event": "hello"},)
     assert rig.preview().pixels.shape == rig.snap().pixels.shape == (4, 4, 3)

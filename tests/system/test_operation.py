@@ -240,3 +240,52 @@ def test_a_bad_configuration_exits_with_2(daemon: Daemon) -> None:
     daemon.config.write_text("[camera]\ndriver = 'virtual'\nwdth = 3\n")
     assert daemon.launch().wait(20) == 2
     assert daemon.log().strip() == f"umbrad: {daemon.config}: camera.wdth: there is no such key"
+
+
+def test_an_emergency_stop_before_the_run_has_the_devices(daemon: Daemon) -> None:
+    # Manual work whose safe state takes its time: the run is chosen, but not yet in its session.
+    daemon.configure(projector='faults = ["timeout:safe@2"]')
+    with daemon.start() as rig, daemon.connect() as other:
+        rig.show(umbra.WHITE)
+        run = rig.scan(LONG)
+        other.estop()
+        info = run.wait(30, check=False)
+        assert info.state is RunState.ABORTED
+        assert info.recorded == 0
+        assert rig.status().state is RigState.ESTOPPED
+
+
+def test_an_emergency_stop_outlives_the_daemon(daemon: Daemon) -> None:
+    with daemon.start() as rig:
+        waiting = rig.scan(LONG)
+        queued = rig.scan(umbra.TwoImage())
+        recorded(rig, waiting.id, 1)
+        rig.estop()
+        daemon.kill()
+    with daemon.start() as rig:
+        assert rig.status().state is RigState.ESTOPPED
+        assert rig.run(queued.id).refresh().state is RunState.QUEUED
+        rig.reset()
+        assert rig.run(queued.id).wait(60).state is RunState.DONE
+
+
+def test_the_queue_waits_for_a_device_that_is_away(daemon: Daemon) -> None:
+    daemon.configure(camera='faults = ["vanish@12*2"]')
+    with daemon.start() as rig:
+        first = rig.scan(umbra.Checkerboard())
+        second = rig.scan(umbra.TwoImage())
+        assert first.wait(60, check=False).state is RunState.FAILED
+        assert second.wait(60).state is RunState.DONE
+
+
+def test_a_resumed_run_sets_the_camera_as_it_was(daemon: Daemon) -> None:
+    with daemon.start() as rig:
+        run = rig.scan(LONG)
+        recorded(rig, run.id, 10)
+        daemon.kill()
+    with daemon.start() as rig:
+        rig.camera(pixel_format="Mono12")
+        rig.resume(run.id)
+        run = rig.run(run.id)
+        run.wait(60)
+        assert run.result().direct.shape == (120, 160, 3)

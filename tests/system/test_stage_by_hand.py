@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import umbra
 from protocol.errors import Code, UmbraError
 from protocol.messages import RigState, RunState, StageChanged, StageState
+from tests.drivers.grbl_peer import GrblPeer
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system
@@ -127,6 +129,33 @@ def test_an_emergency_stop_ends_it(staged: Daemon) -> None:
         with pytest.raises(UmbraError) as caught:
             rig.stage_move(10, 10, 50)
         assert caught.value.code is Code.ESTOPPED
+
+
+def test_a_real_controller(daemon: Daemon, tmp_path: Path) -> None:
+    """The same over Grbl's own protocol: homing is silent, an arc is many lines."""
+    with GrblPeer(tmp_path, speed=4.0, resets_on_open=False) as peer:
+        daemon.configure(scale=1, more=f'[stage]\ndriver = "grbl"\nport = "{peer.link}"')
+        peer.faults.homing_s = 1.0
+        with daemon.start() as rig:
+            begun = rig.stage_home(20.0)
+            assert rig.stage().state is begun.state is StageState.HOMING
+            until(lambda: at(rig, StageState.IDLE))
+            rig.stage_move(-10, -10, 20)
+            until(lambda: at(rig, StageState.IDLE))
+            assert rig.stage().position_mm == pytest.approx((-10, -10), abs=0.01)
+            rig.stage_circle((-10, -10), 4, 20)
+            until(lambda: (rig.stage().position_mm or (0, 0))[0] < -13)
+            stopped = rig.stage_stop()
+            assert stopped.state is StageState.IDLE
+            assert stopped.position_mm is not None
+            rig.stage_circle((-10, -10), 4, 20, turns=0.5)
+            until(lambda: at(rig, StageState.IDLE))
+            assert rig.stage().position_mm == pytest.approx((-14, -10), abs=0.01)
+            peer.faults.switch_missing = True
+            rig.stage_home(20.0)
+            until(lambda: at(rig, StageState.ALARM))
+            assert "switch" in rig.stage().detail
+            assert rig.stage_unlock().state is StageState.UNKNOWN
 
 
 def test_a_rig_without_a_stage(daemon: Daemon) -> None:

@@ -1,0 +1,69 @@
+"""Advice on pattern, images and exposure from a short sweep of checker sizes (Appendix A)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from daemon.scans.calibrate_dark import exposure_of
+from daemon.scans.measuring import MeasuringMethod
+from daemon.scans.method import Bench, Expose, Unsuitable
+from daemon.scans.pattern_scan import leakage_of, response_of
+from daemon.separation.advice import Advice, Situation
+from daemon.separation.estimator import Lighting
+from protocol.patterns import BLACK, WHITE, Checker
+from protocol.scans import Advise, Radiometry
+
+
+class AdviseMethod(MeasuringMethod[Advise]):
+    """Source off, black, white; then checkers of each size at half-checker shifts, and their
+    complements."""
+
+    name: ClassVar[str] = "advise"
+    looked_at: ClassVar[bool] = False  # the finest checkers look alike, by design
+
+    def __init__(self, spec: Advise, bench: Bench) -> None:
+        super().__init__(spec, bench)
+        projector = self._projector()
+        self._sizes = tuple(sorted(set(spec.sizes)))
+        if len(self._sizes) < 2 or 2 * self._sizes[-1] > min(projector.width, projector.height):
+            raise Unsuitable(
+                "two sizes at least are needed, and the largest at most half of the projector's "
+                f"{projector.width} x {projector.height}",
+                "$.sizes",
+            )
+        patterns = [pattern for size in self._sizes for pattern in _sweep(size)]
+        self._images = tuple(len(_sweep(size)) for size in self._sizes)
+        references = ((None, Lighting.AMBIENT), (BLACK, Lighting.BLACK), (WHITE, Lighting.WHITE))
+        self._plan = [
+            *(Expose(p, lighting, frames=4 * spec.average) for p, lighting in references),
+            *(
+                Expose(pattern, Lighting.PATTERN, index, spec.average)
+                for index, pattern in enumerate(patterns)
+            ),
+        ]
+
+    def estimator(self) -> Advice:
+        """See `Method`."""
+        projector = self._projector()
+        return Advice(
+            response_of(Radiometry(), self.bench),
+            self._sizes,
+            self._images,
+            Situation(
+                error=self.spec.error,
+                exposure_us=exposure_of(self.spec.exposure_us, self.bench),
+                exposure_range_us=self.bench.camera.exposure_range_us,
+                refresh_hz=projector.refresh_hz,
+                leakage=leakage_of(Radiometry(), self.bench),
+                known=frozenset(self.bench.calibration or {}),
+            ),
+        )
+
+
+def _sweep(size: int) -> list[Checker]:
+    return [
+        Checker(size=size, shift_x=x, shift_y=y, inverted=inverted)
+        for y in sorted({0, size // 2})
+        for x in sorted({0, size // 2})
+        for inverted in (False, True)
+    ]

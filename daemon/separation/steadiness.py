@@ -1,0 +1,90 @@
+"""What black and white frames say of a scan taken after them: did the scene or the source change?
+
+Half of the source, whichever half, lights a pixel on average with ½(W + K), ambient light and
+leakage included: the middle of a checkerboard's extremes, a sinusoid's mean, a pattern with its
+inverse. Blur moves none of them. So a pixel that has another mean moved, and a picture that has one
+all over had another source, or a tone curve that is not the one given.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation.estimator import Lighting, Quality
+from daemon.separation.finish import bits
+from daemon.separation.radiometry import Plane
+from daemon.separation.references import References
+
+_DEVIATIONS = 6.0
+_PART = 0.1  # of the light: less is a bend of a tone curve, or light that was not smooth
+_OFF = 0.02  # of the light, all over the picture
+_WHOLLY_OFF = 0.1  # from here nothing is said of single pixels
+_OVER = 0.005  # leakage above what the black frame allows
+_PLAIN = 0.05  # relative spread of K/W below which it is no room's light
+_SPECK = 3
+_CALM = 9
+
+
+def compare(
+    references: References, half: Plane, deviation: Plane, leakage: float
+) -> tuple[NDArray[np.uint16] | None, dict[str, Any], list[str]]:
+    """MOVED bits (H, W), facts, and advice, of `half` the source's light at each sample and the
+    deviation of its noise (with the references'). None and {} without black and white frames.
+
+    Facts: `mean_ratio`, the median of half/½(W + K), 1 where all is well.
+    """
+    black, white = references.mean(Lighting.BLACK), references.mean(Lighting.WHITE)
+    clipped = references.white_saturated
+    if black is None or white is None or clipped is None:
+        return None, {}, []
+    expected = (white + black) * np.float32(0.5)
+    good = ~clipped & (white - black > 0.1 * float(np.quantile(white - black, 0.99)))
+    if not good.any():
+        return None, {}, []
+    ratio = float(np.median(half[good] / np.maximum(expected[good], np.float32(1e-6))))
+    facts = {"mean_ratio": round(ratio, 4)}
+    lines: list[str] = []
+    noisy = float(np.median(deviation[good] / np.maximum(expected[good], np.float32(1e-6))))
+    if abs(ratio - 1.0) >= max(_OFF, noisy):
+        lines.append(
+            f"under half of the source the scene has {ratio:.2f} of half the light of white and "
+            "black, not 1: the projector's or the camera's tone curve is not linear, or the source "
+            "drifted, and global is wrong by as much: run `umbra calibrate tone`, give the "
+            "camera's curve with --tone, or let the lamp warm up"
+        )
+    else:  # a wrong tone curve makes any K/W
+        lines += _leaks(_calm(black)[good], _calm(white)[good], leakage)
+    if abs(ratio - 1.0) >= _WHOLLY_OFF:
+        return None, facts, lines
+    limit = np.maximum(np.float32(_DEVIATIONS) * deviation, np.float32(_PART) * np.abs(expected))
+    off = (np.abs(half - np.float32(ratio) * expected) > limit) & ~clipped
+    moved = off if off.ndim == 2 else np.asarray(np.logical_or.reduce(off, axis=2))
+    kernel = np.ones((_SPECK, _SPECK), np.uint8)
+    opened = cv2.morphologyEx(moved.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+    return bits(np.asarray(opened) > 0, Quality.MOVED), facts, lines
+
+
+def _calm(plane: Plane) -> Plane:
+    """With less noise."""
+    return np.asarray(cv2.blur(plane, (_CALM, _CALM)), dtype=np.float32).reshape(plane.shape)
+
+
+def _leaks(black: Plane, white: Plane, leakage: float) -> list[str]:
+    """What K/W says of the leakage b: with ambient light it is b or more, everywhere."""
+    low, middle, high = (float(q) for q in np.quantile(black / white, [0.25, 0.5, 0.75]))
+    if leakage > middle + _OVER:
+        return [
+            f"the leakage {leakage:g} cannot be: black frames have {middle:.3f} of the light of "
+            "white ones, ambient light included: run `umbra calibrate leak`, or give --leakage"
+        ]
+    if middle > leakage + 0.01 and high - low < _PLAIN * middle:
+        return [
+            f"black frames have {middle:.3f} of the light of white ones all over the picture, as "
+            f"leakage does and a room's light does not; the leakage is said to be {leakage:g}: run "
+            "`umbra calibrate leak`, or give --leakage"
+        ]
+    return []

@@ -1,0 +1,33 @@
+"""A device's health is never better than what was last seen of it."""
+
+from __future__ import annotations
+
+from daemon import config
+from daemon.rig import Rig
+from drivers.base import DeviceLost
+from protocol.messages import DeviceInfo, Health
+
+
+def test_a_check_that_is_older_than_the_loss_says_nothing() -> None:
+    told: list[DeviceInfo] = []
+    rig = Rig(config.load(None), told.append)
+    try:
+        rig.connect()
+        member = rig._members["camera"]
+        member.next_try = 0.0
+        rig.tend()  # asks for a sign of life
+        assert member.pending is not None
+        member.pending.result(10)  # and has it, but has not looked at it
+        rig.failed(DeviceLost("camera", "grab", "gone"))
+        rig.tend()
+        assert [d.health for d in rig.devices() if d.name == "camera"] == [Health.LOST]
+        rig.tend()  # connects again
+        assert member.pending is not None
+        member.pending.result(10)
+        rig.tend()
+        assert [d.health for d in rig.devices() if d.name == "camera"] == [Health.READY]
+        assert [i.health for i in told if i.name == "camera"] == [
+            Health.READY, Health.LOST, Health.READY,
+        ]  # fmt: skip
+    finally:
+        rig.close()

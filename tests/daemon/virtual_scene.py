@@ -1,0 +1,104 @@
+"""The virtual rig's scene without its devices: a method's frames straight from the light transport,
+for what takes many scans."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon import patterns
+from daemon.scans import catalog
+from daemon.scans.method import Bench, Expose, Taken
+from daemon.separation.estimator import Components
+from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.virtual.geometry import Pinhole
+from drivers.virtual.scene import TARGET
+from drivers.virtual.transport import Transport, transport
+from drivers.virtual.view import View, view
+from protocol.scans import AnyScan
+
+FULL = 4095
+BLACK = 64
+
+
+@dataclass
+class VirtualScene:
+    """A 12-bit Bayer camera and a projector of as many pixels: see the virtual rig's options."""
+
+    width: int = 320
+    height: int = 240
+    leakage: float = 0.02
+    defocus: float = 0.6
+    gamma: float = 1.0
+    level: float = 0.8  # of the scale, for radiance 1
+    read: float = 1.2  # counts
+    electrons: float = 10_500.0  # at full scale
+
+    @cached_property
+    def operator(self) -> Transport:
+        """T."""
+        at = Pinhole((230.0, 420.0, -230.0), TARGET, self.width, self.height, math.radians(21.0))
+        return transport(self.width, self.height, at)
+
+    @property
+    def view(self) -> View:
+        """What the camera sees: where the mirror is, for one."""
+        return view(self.width, self.height)
+
+    def mirrored(self) -> NDArray[np.bool_]:
+        """Where light by way of the mirror is a third of the light and more: (H, W)."""
+        lit = self.operator.light(np.ones((self.height, self.width), np.float32))
+        whole = np.add(*self.operator.render(lit, "RG"))
+        seen = self.view.mirrored
+        albedo = np.asarray(seen.surface.albedo).mean(axis=2)
+        share = np.zeros_like(whole)
+        seen.region.cut(share)[...] = lit.mirrored * seen.weight.mean(axis=2) * albedo
+        unit = float(self.operator._unit)
+        return np.asarray(~self.view.smooth & (share / unit > 0.3 * whole))
+
+    def bench(self) -> Bench:
+        """The rig's facts."""
+        return Bench(
+            CameraInfo(self.width, self.height, PixelFormat.BAYER_RG12, black_level=BLACK),
+            ProjectorInfo(self.width, self.height, refresh_hz=60),
+        )
+
+    def frame(self, step: Expose, rng: np.random.Generator) -> NDArray[np.uint16]:
+        """What the camera counts under a step's pattern."""
+        light: NDArray[Any] = np.zeros((self.height, self.width), np.float32)
+        if step.pattern is not None:
+            shown = patterns.render(step.pattern, self.width, self.height) / np.float32(255)
+            lit = self.leakage + (1 - self.leakage) * shown**self.gamma
+            emitted = np.asarray(lit, np.float32)
+            if self.defocus:
+                blurred = cv2.GaussianBlur(
+                    emitted, (0, 0), self.defocus, borderType=cv2.BORDER_REPLICATE
+                )
+                emitted = np.asarray(blurred, np.float32)
+            light = np.add(*self.operator.render(self.operator.light(emitted), "RG"))
+        counts = light * self.level * (FULL - BLACK)
+        shot = np.sqrt(np.maximum(counts, 0) * FULL / self.electrons)
+        noisy = counts + rng.standard_normal(counts.shape) * np.hypot(shot, self.read) + BLACK
+        return np.asarray(np.rint(np.clip(noisy, 0, FULL)), np.uint16)
+
+    def scan(self, spec: AnyScan, seed: int = 1) -> Components:
+        """The whole of a scan, as the daemon does it."""
+        rng = np.random.default_rng(seed)
+        method = catalog.method_for(spec, self.bench())
+        estimator = method.estimator()
+        index = 0
+        while (step := method.step(index, estimator.summary())) is not None:
+            assert isinstance(step, Expose)
+            for sub in range(step.frames):
+                observation = method.observe(step, Taken(index, sub, incomplete=False))
+                estimator.update(self.frame(step, rng), observation)
+            index += 1
+        components = estimator.result()
+        assert isinstance(components, Components)
+        return method.conclude(components)
