@@ -202,6 +202,7 @@ class RankedMethod(PatternMethod[P]):
                 lit_fraction=self.lit_fraction,
                 leakage=self.leakage,
                 average=self.spec.average,
+                levels=self.levels,
             )
         return TopK(
             self.response,

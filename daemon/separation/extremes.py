@@ -6,6 +6,7 @@ is computed once, at the result. An update is one in-place maximum and one minim
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation
 from daemon.separation.finish import Judgement, finish
+from daemon.separation.order_model import extremes
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
@@ -23,12 +25,22 @@ class MaxMin:
     """L_max and L_min over patterns of one lit fraction -> direct, global (Eq. 8).
 
     With `average` > 1 the frames of each pattern are averaged in linear light before they are
-    compared; a pattern counts once its last frame is in.
+    compared; a pattern counts once its last frame is in. `levels` is as for `TopK`: with it the
+    planes `direct_std`, `global_std` and the bias of noise are stated (at sharp patterns), which
+    is not taken off.
     """
 
     def __init__(
-        self, response: Response, *, lit_fraction: float, leakage: float, average: int = 1
+        self,
+        response: Response,
+        *,
+        lit_fraction: float,
+        leakage: float,
+        average: int = 1,
+        levels: Callable[[float], Plane] | None = None,
     ) -> None:
+        self._extremes = None if levels is None else extremes(levels(0.0))
+        self._average_of = average
         self._response = response
         self._alpha = lit_fraction
         self._leakage = leakage
@@ -104,9 +116,11 @@ class MaxMin:
         if ambient is not None:
             lit, unlit = brightest - ambient, darkest - ambient
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
+        planes, bias = self._stated(brightest, darkest)
         return finish(
             direct,
             indirect,
+            planes=planes,
             response=self._response,
             brightest=brightest,
             saturated=saturated,
@@ -118,9 +132,40 @@ class MaxMin:
                 "lit_fraction": self._alpha,
                 "leakage": self._leakage,
                 "noise_from": self._noise.source,
+                **bias,
                 **self._references.facts(source),
             },
         )
+
+    def _stated(
+        self, brightest: Plane, darkest: Plane
+    ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        """Deviations of the components from noise, and the medians of what noise adds to them."""
+        if self._extremes is None:
+            return {}, {}
+        b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
+        most, least = (self._noise.deviation(light) for light in (brightest, darkest))
+        of = self._extremes
+        high, low = most * np.float32(of.lit_spread), least * np.float32(of.unlit_spread)
+        reference = 0.0
+        for kind in (Lighting.AMBIENT, Lighting.BLACK):
+            if not reference and self._references.frames(kind):
+                reference = self._average_of / self._references.frames(kind)
+        scale = np.float32(1.0 / ((1.0 - b) * g))
+        of_dark = np.square(low) + np.square(least) * np.float32(reference * (1.0 - b) ** 2)
+        planes: dict[str, NDArray[Any]] = {
+            "direct_std": np.hypot(high, low) * np.float32(1.0 / (1.0 - b)),
+            "global_std": np.sqrt(of_dark + np.square(high) * np.float32(b * b)) * scale,
+        }
+        up, down = (
+            float(np.median(light)) * factor
+            for light, factor in ((most, of.lit_bias), (least, of.unlit_bias))
+        )
+        bias = {
+            "direct": round((up - down) / (1.0 - b), 3),
+            "global": round((down - b * up) / ((1.0 - b) * g), 3),
+        }
+        return planes, {"bias_of_noise": bias}
 
     def _light(self, samples: NDArray[Any]) -> Plane:
         return self._response.linear(samples) if self._mean is None else samples

@@ -95,7 +95,7 @@ def finish(
         quality = spread(quality, Quality.SATURATED)
         direct, indirect = (mosaic.demosaic(x, response.bayer) for x in (direct, indirect))
         for name in DEVIATIONS & planes.keys():
-            planes[name] = mosaic.demosaic(planes[name], response.bayer)
+            planes[name] = mosaic.demosaic_deviation(planes[name], response.bayer)
         direct[unknown] = np.nan
         indirect[unknown] = np.nan
     counted = count(quality)

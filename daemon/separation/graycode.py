@@ -83,7 +83,9 @@ class GrayCodeDecoder:
         self._open = observation.pattern
         if observation.used:
             self._mean.add(pixels)
-            self._noise.add(pixels, observation.pattern)
+            if self._images[observation.pattern].bit < FINE:
+                # half of a coarse pattern's picture is dark: bright light's noise is not in it
+                self._noise.add(pixels, observation.pattern)
             if self._saturated is None:
                 self._saturated = np.zeros(pixels.shape, dtype=np.bool_)
             self._saturated |= pixels >= self._response.saturated_from
@@ -134,8 +136,11 @@ class GrayCodeDecoder:
         moved, steady, advice = compare(self._references, half, deviation, b)
         indirect: Plane = total.light - direct
         direct_std = deviation * np.float32(np.sqrt(2.0) / (1.0 - b))
-        share = total.of_half * 0.5 / self._pairs + total.of_frame * self._average
-        global_std: Plane = np.sqrt(direct_std**2 + deviation**2 * np.float32(share))
+        share = np.asarray(
+            total.of_half * np.float32(0.5 / self._pairs) + total.of_frame * self._average,
+            dtype=np.float32,
+        )
+        global_std: Plane = np.sqrt(direct_std**2 + deviation**2 * share)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": direct_std,
             "global_std": global_std,

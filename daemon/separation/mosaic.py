@@ -52,6 +52,23 @@ def demosaic(mosaic: Plane, bayer: str) -> Plane:
     return rgb
 
 
+def demosaic_deviation(deviation: Plane, bayer: str) -> Plane:
+    """Standard deviations (H, W) of independent samples -> those of `demosaic`'s colours (H, W, 3):
+    a colour that is the mean of n neighbours has less noise than a sample."""
+    valid = np.isfinite(deviation)
+    variance = np.where(valid, np.square(deviation), np.float32(0))
+    rgb = np.empty((*deviation.shape, 3), dtype=np.float32)
+    masks = colour_masks((deviation.shape[0], deviation.shape[1]), bayer)
+    for channel, mask in enumerate(masks):
+        kernel = _CROSS if channel == 1 else _SQUARE
+        present = (mask & valid).astype(np.float32)
+        weight = _filter(present, kernel)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            spread = np.sqrt(_filter(variance * present, np.square(kernel))) / weight
+        rgb[..., channel] = np.where(mask, deviation, spread)
+    return rgb
+
+
 def _filter(plane: Plane, kernel: Plane) -> Plane:
     filtered = cv2.filter2D(plane, -1, kernel, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(filtered, dtype=np.float32)

@@ -89,6 +89,26 @@ def _errors(levels: NDArray[np.float64], keep: int) -> OrderErrors:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Extremes:
+    """Bias and spread of the largest and the smallest sample for noise of deviation 1, far smaller
+    than the step from unlit to lit."""
+
+    lit_bias: float
+    unlit_bias: float
+    lit_spread: float
+    unlit_spread: float
+
+
+def extremes(levels: Plane) -> Extremes:
+    """For a sharp pattern set, `levels` (patterns, samples) as for `simulate` with no blur."""
+    noise = np.random.default_rng(0).standard_normal(levels.shape)
+    lit = np.where(levels > 0.5, noise, -np.inf).max(axis=0)
+    unlit = np.where(levels <= 0.5, noise, np.inf).min(axis=0)
+    lit, unlit = lit[np.isfinite(lit)], unlit[np.isfinite(unlit)]
+    return Extremes(*(float(v) for v in (lit.mean(), unlit.mean(), lit.std(), unlit.std())))
+
+
 def fit(
     models: tuple[OrderErrors, ...], gaps: NDArray[np.float64], seen: NDArray[np.float64]
 ) -> tuple[int, NDArray[np.float64]]:

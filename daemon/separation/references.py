@@ -17,11 +17,11 @@ from daemon.separation.radiometry import FrameMean, Plane, Response
 @dataclass(frozen=True, slots=True)
 class Total:
     """L_d + L_g, and what the variance of light under half of the source and of one frame makes of
-    its variance, as factors."""
+    its variance, as factors (one for all, or one a sample)."""
 
     light: Plane
-    of_half: float
-    of_frame: float
+    of_half: float | Plane
+    of_frame: float | Plane
     source: str
 
 
@@ -75,8 +75,13 @@ class References:
         if whole is None or self._white_saturated is None:
             return Total(total, weight**2, share, "black frame")
         if self._white_saturated.any():
-            total = np.where(self._white_saturated, total, whole.light)
-            return Total(total, weight**2, share, whole.source)
+            clipped = self._white_saturated
+            return Total(
+                np.where(clipped, total, whole.light),
+                np.where(clipped, np.float32(weight**2), np.float32(whole.of_half)),
+                np.where(clipped, np.float32(share), np.float32(whole.of_frame)),
+                whole.source,
+            )
         return whole
 
     def whole(self, leakage: float) -> Total | None:

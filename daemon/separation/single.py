@@ -15,6 +15,10 @@ from daemon.separation.noise import from_frame
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 
+_PEAK = 0.82 * 0.9
+"""Deviation of a row's peaks in a square over a pixel's: a peak is the larger of two pixels as
+bright, and light interpolated between peaks is the mean of more than one."""
+
 
 class PeaksAndValleys:
     """The newest image -> direct, global at 1/`reduce` of its size.
@@ -22,8 +26,8 @@ class PeaksAndValleys:
     A pixel is a peak (valley) when it is the brightest (darkest) of `window` pixels across the
     stripes by `along` pixels along them. Light between peaks is interpolated across the stripes and
     averaged over `reduce` x `reduce` pixels; likewise between valleys; then Eq. 8. Each colour of a
-    mosaic is a picture of its own, of half the size. Every image is separated on its own, so a
-    stream of them is separated live; memory does not grow.
+    mosaic is a picture of its own, of half the size. Planes: `direct_std`, `global_std`.
+    Every image is separated on its own, so a stream is separated live; memory does not grow.
     """
 
     def __init__(
@@ -55,6 +59,7 @@ class PeaksAndValleys:
         self._saturated: NDArray[np.bool_] | None = None
         self._clipped: NDArray[np.bool_] | None = None  # of the frames being averaged
         self._images = 0
+        self._frames = 0  # averaged into the picture
         self._unused = 0
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
@@ -78,6 +83,7 @@ class PeaksAndValleys:
 
     def _close(self) -> None:
         if self._mean.frames:
+            self._frames = self._mean.frames
             self._picture = self._mean.value()
             self._saturated = self._clipped
             self._images += 1
@@ -93,12 +99,13 @@ class PeaksAndValleys:
         ambient, source = self._references.ambient(
             lit, unlit, self._alpha, self._leakage, self._reduced
         )
-        brightest = lit
+        brightest, darkest = lit, unlit
         if ambient is not None:
             lit, unlit = lit - ambient, unlit - ambient
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
         saturated = self._reduced(self._saturated.astype(np.float32)) > 0
         deviation = self._deviation(picture, brightest)
+        planes = self._stated(deviation, self._deviation(picture, darkest))
         plain = Response(
             self._response.full_scale,
             self._response.black,
@@ -108,6 +115,7 @@ class PeaksAndValleys:
         return finish(
             direct,
             indirect,
+            planes=planes,
             response=plain,
             brightest=brightest,
             saturated=saturated,
@@ -127,6 +135,27 @@ class PeaksAndValleys:
     def summary(self) -> dict[str, float]:
         """Images separated, and frames not used."""
         return {"images": float(self._images), "unused": float(self._unused)}
+
+    def _stated(self, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
+        """Deviations of the components from those of one pixel's peaks and valleys.
+
+        A peak is the largest of a few pixels as bright; it speaks for its row up to the next peak,
+        so that a square of k x k averages k rows of about one peak each.
+        """
+        rows = max(self._reduce // 2 if self._response.bayer else self._reduce, 1)
+        share = np.float32(_PEAK / np.sqrt(rows * max(self._frames, 1)))
+        b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
+        reference = 0.0
+        for kind in (Lighting.AMBIENT, Lighting.BLACK):
+            if not reference and self._references.frames(kind):
+                reference = (1.0 - b) ** 2 / (self._references.frames(kind) * rows**2)
+        high, low = most * share, least * share
+        of_dark = np.square(low) + np.square(least) * np.float32(reference)
+        of_lit = np.square(high) * np.float32(b * b)
+        return {
+            "direct_std": np.hypot(high, low) * np.float32(1.0 / (1.0 - b)),
+            "global_std": np.sqrt(of_dark + of_lit) * np.float32(1.0 / ((1.0 - b) * g)),
+        }
 
     def _deviation(self, picture: Plane, brightest: Plane) -> Plane:
         counts = self._response.counts(picture)

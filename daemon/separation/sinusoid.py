@@ -215,7 +215,8 @@ class LeastSquares:
         indirect: Plane = total.light - direct
         variance = sigma * sigma
         direct_var: Plane = variance * np.float32(wave_var * (2.0 * gain / (1.0 - b)) ** 2)
-        total_var: Plane = variance * np.float32(mean_var * total.of_half + total.of_frame)
+        of_total = np.asarray(mean_var * total.of_half + total.of_frame, dtype=np.float32)
+        total_var: Plane = variance * of_total
         return direct, indirect, direct_var, direct_var + total_var
 
     def _mirrored(self, fit: _Fit, noise: Noise | None) -> NDArray[np.bool_]:

@@ -137,7 +137,7 @@ class TopK:
         advice: list[str] = []
         if abs(self._alpha - 0.5) < _HALF:
             middle = (lit + unlit) * np.float32(0.5)
-            moved, steady, advice = compare(self._references, middle, deviation, b)
+            moved, steady, advice = compare(self._references, middle, deviation, b, ranked=True)
         ambient, source = self._references.ambient(lit, unlit, self._alpha, b)
         if ambient is not None:
             lit, unlit = lit - ambient, unlit - ambient

@@ -1,0 +1,74 @@
+"""The deviation that a scan states against how much the same scan differs when it is repeated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daemon.separation.estimator import Quality
+from protocol.scans import (
+    AnySeparation,
+    Checkerboard,
+    GrayCode,
+    Radiometry,
+    RandomBinary,
+    SingleImage,
+    Sinusoid,
+    TwoImage,
+)
+from tests.daemon.scene import Scene
+from tests.daemon.virtual_scene import VirtualScene
+
+LIGHT = Radiometry(leakage=0.02)
+SCANS = 6
+UNSURE = Quality.SATURATED | Quality.DARK | Quality.LOW_MODULATION | Quality.RESIDUE
+
+
+def _ratios(scene: Scene | VirtualScene, spec: AnySeparation) -> dict[str, float]:
+    """Stated over real deviation of direct and of global: medians over good pixels."""
+    scans = [scene.scan(spec, seed=seed) for seed in range(SCANS)]
+    good = np.all([(scan.quality & np.uint16(UNSURE)) == 0 for scan in scans], axis=0)
+    assert good.mean() > 0.2
+    found = {}
+    for name, plane in (("direct", "direct_std"), ("global_", "global_std")):
+        real = np.stack([getattr(scan, name) for scan in scans]).var(axis=0, ddof=1)[good]
+        stated = np.stack([scan.planes[plane] for scan in scans]).mean(axis=0)[good]
+        mean = np.median(real) / (1 - 2 / (9 * (SCANS - 1))) ** 3  # of a χ², from its median
+        found[name] = float(np.median(stated) / np.sqrt(mean))
+    return found
+
+
+@pytest.mark.parametrize("sigma", [0.003, 0.02])
+@pytest.mark.parametrize(
+    "spec",
+    [
+        Checkerboard(estimator="maxmin", radiometry=LIGHT),
+        Checkerboard(estimator="topk", radiometry=LIGHT),
+        RandomBinary(estimator="maxmin", radiometry=LIGHT),
+        TwoImage(radiometry=LIGHT),
+        GrayCode(radiometry=LIGHT),
+        Sinusoid(phases=8, radiometry=LIGHT),
+        SingleImage(window=5, radiometry=LIGHT),
+    ],
+)
+def test_the_stated_deviation_is_the_real_one(spec: AnySeparation, sigma: float) -> None:
+    for name, ratio in _ratios(Scene(sigma=sigma, leakage=0.02, ambient=0.03), spec).items():
+        assert 0.7 < ratio < 1.25, name
+
+
+@pytest.mark.parametrize("spec", [Sinusoid(phases=8, radiometry=LIGHT), GrayCode(radiometry=LIGHT)])
+@pytest.mark.parametrize("level", [0.8, 0.2])
+def test_it_is_so_in_a_mosaic_with_shot_noise(spec: AnySeparation, level: float) -> None:
+    for name, ratio in _ratios(VirtualScene(level=level), spec).items():
+        assert 0.8 < ratio < 1.25, name
+
+
+def test_maxmin_says_what_its_noise_adds() -> None:
+    """Against scans of the same scene without noise."""
+    spec = Checkerboard(estimator="maxmin", radiometry=LIGHT)
+    clean, noisy = (
+        Scene(sigma=sigma, leakage=0.02, ambient=0.03).scan(spec) for sigma in (0.0, 0.01)
+    )
+    told = noisy.facts["bias_of_noise"]
+    assert told["direct"] == pytest.approx(np.mean(noisy.direct - clean.direct), rel=0.15)
+    assert told["global"] == pytest.approx(np.mean(noisy.global_ - clean.global_), rel=0.15)
