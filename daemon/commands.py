@@ -6,31 +6,26 @@ import asyncio
 import itertools
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import asdict
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from daemon import __version__, discovery, measured, picture, products
-from daemon.calibration import Calibrations
+from daemon.byhand import ByHand
 from daemon.config import RigConfig
 from daemon.doctor.examination import Doctor
 from daemon.logs import LogBook
 from daemon.manual import Manual
 from daemon.publisher import Publisher
 from daemon.rig import SAFE_S, Rig
-from daemon.runner import LOCK, Runner
+from daemon.runner import Runner
 from daemon.scans import catalog
 from daemon.separation.estimator import Components, Result
-from daemon.server import Answer, Caller
+from daemon.server import Answer, Asked, Caller
 from daemon.store import RunFolder, Store
-from daemon.viewfinder import Glimpse, Viewfinder, cells, facts_of
-from drivers.base import CameraSettings as DriverSettings
-from drivers.base import PixelFormat
+from daemon.viewfinder import Glimpse, Viewfinder, cells
 from protocol import messages as m
 from protocol.errors import Code, UmbraError
-
-T = TypeVar("T")
 
 ESTOP = "estop"
 """An emergency stop: the reason to hold the queue, and its mark in the data folder."""
@@ -68,9 +63,17 @@ class Commands:
         if self._estopped:
             rig.latch()
             runner.hold(ESTOP)
+        self._by_hand = ByHand(
+            rig=rig,
+            runner=runner,
+            manual=manual,
+            store=store,
+            config=config,
+            estopped=lambda: self._estopped,
+        )
         self._results = asyncio.Semaphore(1)  # one at a time: each takes the estimator's thread
         self.stopping = False
-        self._table: dict[type[m.Command], Callable[[Any, _Asked], Awaitable[Answer]]] = {
+        self._table: dict[type[m.Command], Callable[[Any, Asked], Awaitable[Answer]]] = {
             m.Hello: self._hello,
             m.GetStatus: self._status,
             m.GetDevices: self._devices,
@@ -90,22 +93,7 @@ class Commands:
             m.GetProduct: self._product,
             m.GetLog: self._log,
             m.GetPreview: self._preview,
-            m.StartLive: self._start_live,
-            m.StopLive: self._stop_live,
-            m.Show: self._show,
-            m.Snap: self._snap,
-            m.SetCamera: self._camera,
-            m.SetLight: self._light,
-            m.GetStage: self._stage,
-            m.StageHome: self._stage_home,
-            m.StageMove: self._stage_move,
-            m.StageCircle: self._stage_circle,
-            m.StageStop: self._stage_stop,
-            m.StageUnlock: self._stage_unlock,
-            m.Dark: self._dark,
-            m.Lock: self._lock,
-            m.RenewLock: self._renew,
-            m.Unlock: self._unlock,
+            **self._by_hand.table,
         }
 
     async def handle(
@@ -114,7 +102,7 @@ class Commands:
         """Do a command. Raises UmbraError or DeviceError."""
         if self.stopping and command.role is m.Role.OPERATOR:
             raise UmbraError(Code.STOPPING, "umbrad is shutting down; ask again when it is back")
-        return await self._table[type(command)](command, _Asked(caller, request_id, token))
+        return await self._table[type(command)](command, Asked(caller, request_id, token))
 
     def stop(self, reason: str) -> None:
         """From now on nothing is begun any more."""
@@ -134,7 +122,7 @@ class Commands:
 
     # ------------------------------------------------------------ facts
 
-    async def _hello(self, _: m.Hello, asked: _Asked) -> Answer:
+    async def _hello(self, _: m.Hello, asked: Asked) -> Answer:
         return Answer(
             m.Welcome(
                 protocol=m.PROTOCOL,
@@ -148,7 +136,7 @@ class Commands:
             )
         )
 
-    async def _status(self, _: m.GetStatus, __: _Asked) -> Answer:
+    async def _status(self, _: m.GetStatus, __: Asked) -> Answer:
         current = self._runner.current
         return Answer(
             m.Status(
@@ -167,35 +155,35 @@ class Commands:
             )
         )
 
-    async def _devices(self, _: m.GetDevices, __: _Asked) -> Answer:
+    async def _devices(self, _: m.GetDevices, __: Asked) -> Answer:
         return Answer(m.Devices(devices=self._rig.devices()))
 
-    async def _discover(self, command: m.Discover, asked: _Asked) -> Answer:
+    async def _discover(self, command: m.Discover, asked: Asked) -> Answer:
         self._manual.admit(asked.token)
-        self._require_no_run()
+        self._by_hand.require_no_run()
         searches = await discovery.discover(
             command.drivers, command.timeout_s, self._config.devices, self._rig.devices()
         )
         return Answer(m.Discovered(searches=searches))
 
-    async def _examine(self, command: m.Examine, asked: _Asked) -> Answer:
+    async def _examine(self, command: m.Examine, asked: Asked) -> Answer:
         doctor = self._doctor
         if not command.passive:
-            self._require_hands(asked)
+            self._by_hand.require(asked)
         writes = self._runner.current is not None
         checks = await asyncio.to_thread(doctor.look, run_writes=writes)
         if not command.passive:
-            checks += await self._by_hand(asked, doctor.expose)
+            checks += await self._by_hand.do(asked, doctor.expose)
         return Answer(m.Examined(checks=tuple(checks)))
 
-    async def _log(self, command: m.GetLog, _: _Asked) -> Answer:
+    async def _log(self, command: m.GetLog, _: Asked) -> Answer:
         if command.run:
             await asyncio.to_thread(self._store.open, command.run)  # a name that is wrong is said
         return Answer(m.Log(records=self._book.records(command.run, command.limit)))
 
     # ------------------------------------------------------------ runs
 
-    async def _submit(self, command: m.Submit, asked: _Asked) -> Answer:
+    async def _submit(self, command: m.Submit, asked: Asked) -> Answer:
         if (known := self._runner.submitted(asked.request_id)) is not None:
             return _about(known)
         self._manual.admit(asked.token)
@@ -213,23 +201,23 @@ class Commands:
         )
         return _about(run)
 
-    async def _queue(self, _: m.GetQueue, __: _Asked) -> Answer:
+    async def _queue(self, _: m.GetQueue, __: Asked) -> Answer:
         return Answer(m.Runs(runs=tuple(run.info() for run in self._runner.queue())))
 
-    async def _move(self, command: m.MoveQueued, asked: _Asked) -> Answer:
+    async def _move(self, command: m.MoveQueued, asked: Asked) -> Answer:
         self._manual.admit(asked.token)
         queue = await asyncio.to_thread(self._runner.move, command.run, command.to)
         return Answer(m.Runs(runs=tuple(run.info() for run in queue)))
 
-    async def _pause(self, command: m.Pause, asked: _Asked) -> Answer:
+    async def _pause(self, command: m.Pause, asked: Asked) -> Answer:
         self._manual.admit(asked.token)
         return _about(self._runner.pause(command.run))
 
-    async def _resume(self, command: m.Resume, asked: _Asked) -> Answer:
+    async def _resume(self, command: m.Resume, asked: Asked) -> Answer:
         self._manual.admit(asked.token)
         return _about(await asyncio.to_thread(self._runner.resume, command.run))
 
-    async def _abort(self, command: m.Abort, asked: _Asked) -> Answer:
+    async def _abort(self, command: m.Abort, asked: Asked) -> Answer:
         by = command.by or asked.caller.name
         # Here and not in a worker: what waits for the workers must not delay it.
         current = self._runner.abort_current(command.run, by)
@@ -237,7 +225,7 @@ class Commands:
             current = await asyncio.to_thread(self._runner.abort, command.run, by)
         return _about(current)
 
-    async def _estop(self, command: m.EStop, asked: _Asked) -> Answer:
+    async def _estop(self, command: m.EStop, asked: Asked) -> Answer:
         by = command.by or asked.caller.name
         self._estopped = True
         self._runner.hold(ESTOP)
@@ -253,7 +241,7 @@ class Commands:
             )
         return Answer(m.Done(message="stopped: dark and held; `umbra reset` ends it"))
 
-    async def _reset(self, _: m.Reset, __: _Asked) -> Answer:
+    async def _reset(self, _: m.Reset, __: Asked) -> Answer:
         await asyncio.to_thread(self._rig.require_ready)
         await asyncio.to_thread(self._store.unmark, ESTOP)
         self._rig.unlatch()
@@ -262,7 +250,7 @@ class Commands:
         self.changed("reset")
         return Answer(m.Done(message="the queue goes on"))
 
-    async def _runs(self, command: m.ListRuns, _: _Asked) -> Answer:
+    async def _runs(self, command: m.ListRuns, _: Asked) -> Answer:
         def listed() -> tuple[m.RunInfo, ...]:
             runs = self._store.runs()
             chosen = (r for r in runs if command.state is None or r.file.state is command.state)
@@ -270,10 +258,10 @@ class Commands:
 
         return Answer(m.Runs(runs=await asyncio.to_thread(listed)))
 
-    async def _run(self, command: m.GetRun, _: _Asked) -> Answer:
+    async def _run(self, command: m.GetRun, _: Asked) -> Answer:
         return _about(await asyncio.to_thread(self._runner.find, command.run))
 
-    async def _result(self, command: m.GetResult, _: _Asked) -> Answer:
+    async def _result(self, command: m.GetResult, _: Asked) -> Answer:
         def result() -> Answer:
             run = self._runner.find(command.run)
             found, facts = self._result_of(run)
@@ -297,7 +285,7 @@ class Commands:
         measurement = measured.read(run)
         return (measurement, measurement.facts) if measurement else products.read(run)
 
-    async def _product(self, command: m.GetProduct, _: _Asked) -> Answer:
+    async def _product(self, command: m.GetProduct, _: Asked) -> Answer:
         def part() -> Answer:
             run = self._store.open(command.run)
             path = run.product(command.name)
@@ -312,7 +300,7 @@ class Commands:
 
         return await asyncio.to_thread(part)
 
-    async def _preview(self, command: m.GetPreview, _: _Asked) -> Answer:
+    async def _preview(self, command: m.GetPreview, _: Asked) -> Answer:
         def look() -> Answer:
             if command.what == "frame":
                 glimpse = self._viewfinder.latest()
@@ -337,131 +325,6 @@ class Commands:
 
         return await asyncio.to_thread(look)
 
-    # ------------------------------------------------------------ by hand
-
-    async def _by_hand(self, asked: _Asked, act: Callable[[], T]) -> T:
-        self._require_hands(asked)
-        return await asyncio.to_thread(act)
-
-    def _require_hands(self, asked: _Asked) -> None:
-        """Raise UmbraError unless this client may use the devices by hand now."""
-        self._manual.admit(asked.token)
-        if self._estopped:
-            raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
-        self._require_no_run()
-
-    def _require_no_run(self) -> None:
-        current = self._runner.current
-        if current is not None:
-            raise UmbraError(
-                Code.BUSY,
-                f"{current.id} is using the devices; wait for it, or `umbra abort`",
-            )
-
-    async def _start_live(self, command: m.StartLive, asked: _Asked) -> Answer:
-        def look() -> None:
-            bench = None
-            if command.separate is not None:
-                bench = self._rig.bench(self._calibration())
-            self._manual.look(command.rate_hz, command.lease_s, command.separate, bench)
-
-        await self._by_hand(asked, look)
-        return Answer(m.Done(message=f"live for {command.lease_s:g} s, unless asked again"))
-
-    def _calibration(self) -> dict[str, Any]:
-        """The values that apply to the rig as it is now."""
-        camera = self._rig.camera.device
-        in_force = camera.settings()
-        settings = {
-            "exposure_us": in_force.exposure_us,
-            "gain": in_force.gain,
-            "pixel_format": camera.info().pixel_format.value,
-        }
-        found = Calibrations(self._store, self._config.calibration.max_age_days)
-        values: dict[str, Any] = found.of(self._rig.snapshot(), settings)["values"]
-        return values
-
-    async def _stop_live(self, _: m.StopLive, __: _Asked) -> Answer:
-        await asyncio.to_thread(self._manual.live.stop)
-        return Answer(m.Done(message="the live view has ended"))
-
-    async def _show(self, command: m.Show, asked: _Asked) -> Answer:
-        await self._by_hand(asked, lambda: self._manual.show(command.pattern, command.lease_s))
-        return Answer(
-            m.Done(message=f"shown; dark in {command.lease_s:g} s, or with `umbra show off`")
-        )
-
-    async def _snap(self, command: m.Snap, asked: _Asked) -> Answer:
-        def snap() -> Answer:
-            frame, info = self._manual.snap()
-            facts = facts_of(frame, info)
-            if not command.png:
-                return Answer(m.Picture(facts=facts), {"frame": frame.pixels})
-            shown = picture.png(frame.pixels, info.pixel_format, demosaiced=command.demosaic)
-            return Answer(m.Picture(facts=facts), {"png": shown})
-
-        return await self._by_hand(asked, snap)
-
-    async def _camera(self, command: m.SetCamera, asked: _Asked) -> Answer:
-        wanted = _settings(command.settings)
-        if wanted == DriverSettings():
-            in_force = self._rig.camera.device.settings()
-        else:
-            in_force = await self._by_hand(asked, lambda: self._manual.configure(wanted))
-        return Answer(m.Camera(settings=m.CameraSettings(**asdict(in_force))))
-
-    async def _light(self, command: m.SetLight, asked: _Asked) -> Answer:
-        await self._by_hand(asked, lambda: self._manual.light(command.name, command.on))
-        return Answer(m.Done(message=f"{command.name} is {'on' if command.on else 'off'}"))
-
-    async def _stage(self, _: m.GetStage, __: _Asked) -> Answer:
-        return Answer(await asyncio.to_thread(self._manual.stage.status))
-
-    async def _stage_home(self, command: m.StageHome, asked: _Asked) -> Answer:
-        home = self._manual.stage.home
-        return Answer(await self._by_hand(asked, lambda: home(command.timeout_s)))
-
-    async def _stage_move(self, command: m.StageMove, asked: _Asked) -> Answer:
-        def move() -> m.StageStatus:
-            return self._manual.stage.move(command.x_mm, command.y_mm, command.feed_mm_s)
-
-        return Answer(await self._by_hand(asked, move))
-
-    async def _stage_circle(self, command: m.StageCircle, asked: _Asked) -> Answer:
-        def circle() -> m.StageStatus:
-            return self._manual.stage.circle(
-                command.centre_mm, command.radius_mm, command.feed_mm_s, command.turns
-            )
-
-        return Answer(await self._by_hand(asked, circle))
-
-    async def _stage_stop(self, _: m.StageStop, __: _Asked) -> Answer:
-        """Whoever holds the rig: to stop is never refused, but a run is aborted, not stopped."""
-        self._require_no_run()
-        return Answer(await asyncio.to_thread(self._manual.stage.stop))
-
-    async def _stage_unlock(self, _: m.StageUnlock, asked: _Asked) -> Answer:
-        return Answer(await self._by_hand(asked, self._manual.stage.unlock))
-
-    async def _dark(self, _: m.Dark, asked: _Asked) -> Answer:
-        await self._by_hand(asked, self._manual.end)
-        return Answer(m.Done(message="dark"))
-
-    async def _lock(self, command: m.Lock, asked: _Asked) -> Answer:
-        token = await self._by_hand(
-            asked, lambda: self._manual.lock(command.owner, command.note, command.lease_s)
-        )
-        self._runner.hold(LOCK)
-        return Answer(m.Locked(token=token, lease_s=command.lease_s))
-
-    async def _renew(self, _: m.RenewLock, asked: _Asked) -> Answer:
-        return Answer(m.Locked(token=asked.token, lease_s=self._manual.renew(asked.token)))
-
-    async def _unlock(self, command: m.Unlock, asked: _Asked) -> Answer:
-        await asyncio.to_thread(self._manual.unlock, asked.token, force=command.force)
-        self._runner.release(LOCK)
-        return Answer(m.Done(message="the rig is free"))
-
     # ------------------------------------------------------------ events
 
     def changed(self, reason: str = "") -> None:
@@ -469,17 +332,6 @@ class Commands:
         self._publisher.publish(
             m.RigChanged(state=self.state, lock=self._manual.lock_info(), reason=reason)
         )
-
-
-class _Asked:
-    """Who asked, under which id, with which lock token."""
-
-    __slots__ = ("caller", "request_id", "token")
-
-    def __init__(self, caller: Caller, request_id: str, token: str) -> None:
-        self.caller = caller
-        self.request_id = request_id
-        self.token = token
 
 
 def _looked(glimpse: Glimpse, width: int) -> Answer:
@@ -490,24 +342,3 @@ def _looked(glimpse: Glimpse, width: int) -> Answer:
 
 def _about(run: RunFolder) -> Answer:
     return Answer(m.Run(run=run.info()))
-
-
-def _settings(wanted: m.CameraSettings) -> DriverSettings:
-    pixel_format = None
-    if wanted.pixel_format is not None:
-        try:
-            pixel_format = PixelFormat(wanted.pixel_format)
-        except ValueError:
-            known = ", ".join(PixelFormat)
-            raise UmbraError(
-                Code.BAD_REQUEST,
-                f"pixel format {wanted.pixel_format!r} is none of {known}",
-                "$.command.settings.pixel_format",
-            ) from None
-    return DriverSettings(
-        exposure_us=wanted.exposure_us,
-        gain=wanted.gain,
-        pixel_format=pixel_format,
-        frame_rate_hz=wanted.frame_rate_hz,
-        roi=wanted.roi,
-    )

@@ -56,6 +56,15 @@ class Caller:
     name: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Who asked, under which request id, with which lock token."""
+
+    caller: Caller
+    request_id: str
+    token: str
+
+
 Handler = Callable[[AnyCommand, Caller, str, str], Awaitable[Answer]]
 """command, caller, request id, lock token -> answer; raises UmbraError, DeviceError."""
 

@@ -1,0 +1,213 @@
+"""Commands of work by hand: show, snap, live view, camera, lights, stage, and the lock.
+
+They are refused while a run has the devices, while somebody else holds the rig, and during an
+emergency stop; to stop something is never refused.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict
+from typing import Any, TypeVar
+
+from daemon import picture
+from daemon.calibration import Calibrations
+from daemon.config import RigConfig
+from daemon.manual import Manual
+from daemon.rig import Rig
+from daemon.runner import LOCK, Runner
+from daemon.server import Answer, Asked
+from daemon.store import Store
+from daemon.viewfinder import facts_of
+from drivers.base import CameraSettings as DriverSettings
+from drivers.base import PixelFormat
+from protocol import messages as m
+from protocol.errors import Code, UmbraError
+
+T = TypeVar("T")
+
+
+class ByHand:
+    """Answers them; `table` says which. Called from the loop, device calls go to a worker."""
+
+    def __init__(
+        self,
+        *,
+        rig: Rig,
+        runner: Runner,
+        manual: Manual,
+        store: Store,
+        config: RigConfig,
+        estopped: Callable[[], bool],
+    ) -> None:
+        self._rig = rig
+        self._runner = runner
+        self._manual = manual
+        self._store = store
+        self._config = config
+        self._estopped = estopped
+        self.table: dict[type[m.Command], Callable[[Any, Asked], Awaitable[Answer]]] = {
+            m.StartLive: self._start_live,
+            m.StopLive: self._stop_live,
+            m.Show: self._show,
+            m.Snap: self._snap,
+            m.SetCamera: self._camera,
+            m.SetLight: self._light,
+            m.GetStage: self._stage,
+            m.StageHome: self._stage_home,
+            m.StageMove: self._stage_move,
+            m.StageCircle: self._stage_circle,
+            m.StageStop: self._stage_stop,
+            m.StageUnlock: self._stage_unlock,
+            m.Dark: self._dark,
+            m.Lock: self._lock,
+            m.RenewLock: self._renew,
+            m.Unlock: self._unlock,
+        }
+
+    async def do(self, asked: Asked, act: Callable[[], T]) -> T:
+        """Let a worker do something with the devices. Raises UmbraError as `require`."""
+        self.require(asked)
+        return await asyncio.to_thread(act)
+
+    def require(self, asked: Asked) -> None:
+        """Raise UmbraError unless this client may use the devices by hand now."""
+        self._manual.admit(asked.token)
+        if self._estopped():
+            raise UmbraError(Code.ESTOPPED, "an emergency stop is in force; `umbra reset` ends it")
+        self.require_no_run()
+
+    def require_no_run(self) -> None:
+        """Raise UmbraError(busy) while a run has the devices."""
+        current = self._runner.current
+        if current is not None:
+            raise UmbraError(
+                Code.BUSY,
+                f"{current.id} is using the devices; wait for it, or `umbra abort`",
+            )
+
+    async def _start_live(self, command: m.StartLive, asked: Asked) -> Answer:
+        def look() -> None:
+            bench = None
+            if command.separate is not None:
+                bench = self._rig.bench(self._calibration())
+            self._manual.look(command.rate_hz, command.lease_s, command.separate, bench)
+
+        await self.do(asked, look)
+        return Answer(m.Done(message=f"live for {command.lease_s:g} s, unless asked again"))
+
+    def _calibration(self) -> dict[str, Any]:
+        """The values that apply to the rig as it is now."""
+        camera = self._rig.camera.device
+        in_force = camera.settings()
+        settings = {
+            "exposure_us": in_force.exposure_us,
+            "gain": in_force.gain,
+            "pixel_format": camera.info().pixel_format.value,
+        }
+        found = Calibrations(self._store, self._config.calibration.max_age_days)
+        values: dict[str, Any] = found.of(self._rig.snapshot(), settings)["values"]
+        return values
+
+    async def _stop_live(self, _: m.StopLive, __: Asked) -> Answer:
+        await asyncio.to_thread(self._manual.live.stop)
+        return Answer(m.Done(message="the live view has ended"))
+
+    async def _show(self, command: m.Show, asked: Asked) -> Answer:
+        await self.do(asked, lambda: self._manual.show(command.pattern, command.lease_s))
+        return Answer(
+            m.Done(message=f"shown; dark in {command.lease_s:g} s, or with `umbra show off`")
+        )
+
+    async def _snap(self, command: m.Snap, asked: Asked) -> Answer:
+        def snap() -> Answer:
+            frame, info = self._manual.snap()
+            facts = facts_of(frame, info)
+            if not command.png:
+                return Answer(m.Picture(facts=facts), {"frame": frame.pixels})
+            shown = picture.png(frame.pixels, info.pixel_format, demosaiced=command.demosaic)
+            return Answer(m.Picture(facts=facts), {"png": shown})
+
+        return await self.do(asked, snap)
+
+    async def _camera(self, command: m.SetCamera, asked: Asked) -> Answer:
+        wanted = _settings(command.settings)
+        if wanted == DriverSettings():
+            in_force = self._rig.camera.device.settings()
+        else:
+            in_force = await self.do(asked, lambda: self._manual.configure(wanted))
+        return Answer(m.Camera(settings=m.CameraSettings(**asdict(in_force))))
+
+    async def _light(self, command: m.SetLight, asked: Asked) -> Answer:
+        await self.do(asked, lambda: self._manual.light(command.name, command.on))
+        return Answer(m.Done(message=f"{command.name} is {'on' if command.on else 'off'}"))
+
+    async def _stage(self, _: m.GetStage, __: Asked) -> Answer:
+        return Answer(await asyncio.to_thread(self._manual.stage.status))
+
+    async def _stage_home(self, command: m.StageHome, asked: Asked) -> Answer:
+        home = self._manual.stage.home
+        return Answer(await self.do(asked, lambda: home(command.timeout_s)))
+
+    async def _stage_move(self, command: m.StageMove, asked: Asked) -> Answer:
+        def move() -> m.StageStatus:
+            return self._manual.stage.move(command.x_mm, command.y_mm, command.feed_mm_s)
+
+        return Answer(await self.do(asked, move))
+
+    async def _stage_circle(self, command: m.StageCircle, asked: Asked) -> Answer:
+        def circle() -> m.StageStatus:
+            return self._manual.stage.circle(
+                command.centre_mm, command.radius_mm, command.feed_mm_s, command.turns
+            )
+
+        return Answer(await self.do(asked, circle))
+
+    async def _stage_stop(self, _: m.StageStop, __: Asked) -> Answer:
+        """Whoever holds the rig: to stop is never refused, but a run is aborted, not stopped."""
+        self.require_no_run()
+        return Answer(await asyncio.to_thread(self._manual.stage.stop))
+
+    async def _stage_unlock(self, _: m.StageUnlock, asked: Asked) -> Answer:
+        return Answer(await self.do(asked, self._manual.stage.unlock))
+
+    async def _dark(self, _: m.Dark, asked: Asked) -> Answer:
+        await self.do(asked, self._manual.end)
+        return Answer(m.Done(message="dark"))
+
+    async def _lock(self, command: m.Lock, asked: Asked) -> Answer:
+        token = await self.do(
+            asked, lambda: self._manual.lock(command.owner, command.note, command.lease_s)
+        )
+        self._runner.hold(LOCK)
+        return Answer(m.Locked(token=token, lease_s=command.lease_s))
+
+    async def _renew(self, _: m.RenewLock, asked: Asked) -> Answer:
+        return Answer(m.Locked(token=asked.token, lease_s=self._manual.renew(asked.token)))
+
+    async def _unlock(self, command: m.Unlock, asked: Asked) -> Answer:
+        await asyncio.to_thread(self._manual.unlock, asked.token, force=command.force)
+        self._runner.release(LOCK)
+        return Answer(m.Done(message="the rig is free"))
+
+
+def _settings(wanted: m.CameraSettings) -> DriverSettings:
+    pixel_format = None
+    if wanted.pixel_format is not None:
+        try:
+            pixel_format = PixelFormat(wanted.pixel_format)
+        except ValueError:
+            known = ", ".join(PixelFormat)
+            raise UmbraError(
+                Code.BAD_REQUEST,
+                f"pixel format {wanted.pixel_format!r} is none of {known}",
+                "$.command.settings.pixel_format",
+            ) from None
+    return DriverSettings(
+        exposure_us=wanted.exposure_us,
+        gain=wanted.gain,
+        pixel_format=pixel_format,
+        frame_rate_hz=wanted.frame_rate_hz,
+        roi=wanted.roi,
+    )
