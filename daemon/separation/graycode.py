@@ -75,6 +75,7 @@ class GrayCodeDecoder:
         if observation.lighting is not Lighting.PATTERN:
             if observation.used:
                 self._references.add(pixels, observation.lighting)
+                self._noise.add_reference(pixels, observation.lighting)
             else:
                 self._unused += 1
             return

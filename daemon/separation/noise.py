@@ -51,6 +51,20 @@ class Noise:
         bounded = np.min(found[None, :] * grown, axis=1)
         return Noise(self.levels, tuple(float(d) for d in bounded))
 
+    def bounded_by(self, other: Noise) -> Noise:
+        """The lower of two upper bounds where both are known, else the one that is."""
+        levels = np.union1d(self.levels, other.levels)
+        curves = []
+        for one in (self, other):
+            known = np.interp(levels, one.levels, one.deviations)
+            curves.append(
+                np.where((levels < one.levels[0]) | (levels > one.levels[-1]), np.inf, known)
+            )
+        lowest = np.minimum(*curves)
+        # between two ranges neither knows: the line from one to the other
+        inside = np.isfinite(lowest)
+        return Noise(tuple(levels[inside].tolist()), tuple(lowest[inside].tolist()))
+
     @property
     def typical(self) -> float:
         """The median over levels, for people."""

@@ -41,6 +41,7 @@ class ComplementPair:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
+            self._noise.add_reference(pixels, observation.lighting)
         else:
             self._means[observation.pattern].add(pixels)
             self._noise.add(pixels, observation.pattern)
@@ -73,7 +74,7 @@ class ComplementPair:
             brightest=brightest,
             saturated=self._saturated,
             flags=moved,
-            planes=self._deviations(deviation),
+            planes=self._deviations(deviation, self._noise.deviation(np.minimum(first, second))),
             judgement=Judgement.of_extremes(deviation, 2),
             facts={
                 "estimator": "complement pair",
@@ -89,19 +90,21 @@ class ComplementPair:
             },
         )
 
-    def _deviations(self, deviation: Plane) -> dict[str, NDArray[Any]]:
-        """Standard deviations of direct and global from noise; edges of checkers, which are the
-        greater error of two images, are not noise."""
+    def _deviations(self, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
+        """Standard deviations of direct and global from noise where lit and unlit; edges of
+        checkers, which are the greater error of two images, are not noise."""
         b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
         h = light_model.global_weight(1.0 - self._alpha, b)
-        least = min(light_model.complement_determinants(self._alpha, b))
+        singular = min(light_model.complement_determinants(self._alpha, b))
         ambient = 0.0  # of its variance in one frame's, in L_g = (I_unlit - A - b(I_lit - A))/det
         for kind in (Lighting.AMBIENT, Lighting.BLACK):
             if not ambient and self._references.frames(kind):
                 ambient = self._average * (1.0 - b) ** 2 / self._references.frames(kind)
         return {
-            "direct_std": deviation * np.float32(np.hypot(g, h) / least),
-            "global_std": deviation * np.float32(np.sqrt(1.0 + b * b + ambient) / least),
+            "direct_std": np.hypot(most * np.float32(h), least * np.float32(g))
+            * np.float32(1.0 / singular),
+            "global_std": np.hypot(most * np.float32(b), least * np.float32(np.sqrt(1.0 + ambient)))
+            * np.float32(1.0 / singular),
         }
 
     def _ambient(self, first: Plane, second: Plane) -> tuple[Plane | None, str]:

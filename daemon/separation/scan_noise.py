@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.estimator import Lighting
 from daemon.separation.noise import Noise, TemporalNoise, from_frame
 from daemon.separation.radiometry import Plane, Response
 
@@ -28,18 +29,31 @@ class ScanNoise:
         self._average = average
         self._repeats = TemporalNoise(response.full_scale)
         self._picture: Noise | None = None
+        self._pictured = False
+        self._kinds: set[Lighting] = set()
         self._last: tuple[int, NDArray[Any]] | None = None
 
     def add(self, pixels: NDArray[Any], pattern: int) -> None:
         """Take in a frame of a pattern."""
-        if self._picture is None:
-            self._picture = from_frame(pixels, self._response.full_scale, self._response.bayer)
+        if not self._pictured:
+            self._pictured = True
+            self._bound(pixels)
         if self._average == 1:
             return
         sample = np.ascontiguousarray(pixels[::_SAMPLE, ::_SAMPLE])
         if self._last is not None and self._last[0] == pattern:
             self._repeats.add(self._last[1], sample)
         self._last = pattern, sample
+
+    def add_reference(self, pixels: NDArray[Any], lighting: Lighting) -> None:
+        """Take in a reference frame, whose picture has no pattern in it: the first of its kind."""
+        if lighting not in self._kinds:
+            self._kinds.add(lighting)
+            self._bound(pixels)
+
+    def _bound(self, pixels: NDArray[Any]) -> None:
+        found = from_frame(pixels, self._response.full_scale, self._response.bayer)
+        self._picture = found if self._picture is None else self._picture.bounded_by(found)
 
     @property
     def measured(self) -> bool:
