@@ -52,6 +52,19 @@ def check_exposure(endpoints: tuple[str, ...], keys: str) -> None:
             )
 
 
+def check_keys(keys: str) -> None:
+    """Raise ConfigError when the daemon's own keys are not to be had."""
+    if keys:
+        _own_pair(keys)
+
+
+def _own_pair(keys: str) -> KeyPair:
+    try:
+        return load_server(keys)
+    except UmbraError as error:
+        raise ConfigError(f"network.keys: {error.message}") from error
+
+
 class Access:
     """Locks sockets and knows callers. Without keys everybody on this machine is an operator."""
 
@@ -62,10 +75,7 @@ class Access:
         self._authenticator: AsyncioAuthenticator | None = None
         if not keys:
             return
-        try:
-            self._pair = load_server(keys)
-        except UmbraError as error:
-            raise ConfigError(f"network.keys: {error.message}") from error
+        self._pair = _own_pair(keys)
         self._allowed = AllowList(keys)
         self._authenticator = AsyncioAuthenticator(context)
         self._authenticator.configure_curve_callback(DOMAIN, _Provider(self._allowed))

@@ -25,7 +25,7 @@ import zmq
 import zmq.asyncio
 
 from daemon import __version__, config, logs
-from daemon.access import Access, check_exposure
+from daemon.access import Access, check_exposure, check_keys
 from daemon.commands import Commands
 from daemon.doctor.examination import Doctor
 from daemon.manual import Manual
@@ -66,6 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
         network = rig_config.network
         check_exposure((network.command, network.events), network.keys)
         if options.check:
+            check_keys(network.keys)
             print(f"{options.config or 'built-in'}: the configuration is good")
             return 0
         book = logs.configure(options.log_level)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from daemon import __version__, discovery, measured, picture, products
@@ -145,7 +146,7 @@ class Commands:
                 epoch=self._epoch,
                 uptime_s=time.monotonic() - self._began,
                 devices=self._rig.devices(),
-                run=current.info() if current else None,
+                run=self._counted(current) if current else None,
                 progress=self._runner.progress,
                 queue=tuple(run.info() for run in self._runner.queue()),
                 lock=self._manual.lock_info(),
@@ -153,6 +154,18 @@ class Commands:
                 reserve_bytes=self._store.reserve_bytes,
                 sequences=self._publisher.sequences(),
             )
+        )
+
+    def _counted(self, run: RunFolder) -> m.RunInfo:
+        """A run as it is now; its counts are written at its end only, so they are asked for."""
+        info, progress = run.info(), self._runner.progress
+        if progress is None or progress.run != run.id:
+            return info
+        return msgspec.structs.replace(
+            info,
+            recorded=progress.recorded,
+            missing=progress.missing,
+            rejected=progress.rejected,
         )
 
     async def _devices(self, _: m.GetDevices, __: Asked) -> Answer:
@@ -254,12 +267,13 @@ class Commands:
         def listed() -> tuple[m.RunInfo, ...]:
             runs = self._store.runs()
             chosen = (r for r in runs if command.state is None or r.file.state is command.state)
-            return tuple(run.info() for run in itertools.islice(chosen, command.limit))
+            return tuple(self._counted(run) for run in itertools.islice(chosen, command.limit))
 
         return Answer(m.Runs(runs=await asyncio.to_thread(listed)))
 
     async def _run(self, command: m.GetRun, _: Asked) -> Answer:
-        return _about(await asyncio.to_thread(self._runner.find, command.run))
+        run = await asyncio.to_thread(self._runner.find, command.run)
+        return Answer(m.Run(run=self._counted(run)))
 
     async def _result(self, command: m.GetResult, _: Asked) -> Answer:
         def result() -> Answer:

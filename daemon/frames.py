@@ -390,3 +390,14 @@ def _crc32c(data: bytes) -> int:
         for _ in range(8):
             crc = (crc >> 1) ^ (0x82F63B78 if crc & 1 else 0)
     return crc ^ 0xFFFFFFFF
+
+
+def count(folder: Path) -> tuple[int, int]:
+    """Frames recorded and missing in a run's folder, for what a crash left; (0, 0) if unreadable:
+    `FrameStore.open` says what is wrong."""
+    try:
+        records = journal.read(folder / LINES, FrameRecord)
+    except (Damaged, OSError):
+        return 0, 0
+    missing = sum(bool(record.missing) for record in records)
+    return len(records) - missing, missing

@@ -16,6 +16,7 @@ from daemon import aftermath
 from daemon.config import RigConfig
 from daemon.course import Course, utc_now
 from daemon.failures import as_error
+from daemon.frames import count
 from daemon.rig import Rig
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Unsuitable
@@ -89,7 +90,14 @@ class Runner:
             if run.file.state in _UNFINISHED:
                 reason = "umbrad ended while the run was under way; `umbra resume` goes on with it"
                 end = End(state=RunState.INTERRUPTED, reason=reason)
-                run.remember(state=RunState.INTERRUPTED, ended=utc_now(), end=end)
+                recorded, missing = count(run.path)
+                run.remember(
+                    state=RunState.INTERRUPTED,
+                    ended=utc_now(),
+                    end=end,
+                    recorded=recorded,
+                    missing=missing,
+                )
                 log.warning("run interrupted", run=run.id)
         self.tend()
 
@@ -329,6 +337,12 @@ class Runner:
         course = self._active
         if course is None or run not in {"", course.folder.id}:
             return None
+        if course.folder.file.state is RunState.FINISHING:
+            raise UmbraError(
+                Code.WRONG_STATE,
+                f"{course.folder.id} has all its frames and is writing its products: the devices "
+                "are safe, and it will be done in a moment",
+            )
         course.control.end(RunState.ABORTED, "aborted", by=by)
         self._rig.make_safe()
         return course.folder

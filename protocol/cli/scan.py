@@ -18,7 +18,7 @@ from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.options import with_options
 from protocol.cli.output import print_json, say
 from protocol.cli.runs import Force, fetch, wanted
-from protocol.cli.watch import conclude, follow, goes_on
+from protocol.cli.watch import conclude, follow, goes_on, tell
 from protocol.cli.words import Fetched
 from protocol.errors import Code, UmbraError
 from protocol.messages import Run
@@ -58,6 +58,8 @@ def scan(
         with goes_on(run.id):
             follow(run)
         code = conclude(run.info)
+        if not as_json and not code:
+            tell(run.facts())
         files = (
             []
             if delivery is None or code

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,7 +17,7 @@ from protocol.cli.options import with_options
 from protocol.cli.output import print_json, say
 from protocol.cli.private import private_daemon
 from protocol.cli.runs import Force, fetch, wanted
-from protocol.cli.watch import follow, must_be_done
+from protocol.cli.watch import follow, must_be_done, tell
 from protocol.cli.words import Fetched, frames
 from protocol.errors import Code, UmbraError
 from protocol.messages import Health, RunInfo
@@ -110,10 +110,11 @@ def _separate(
             follow(run, title=f"{source.name or source} {method}")
             must_be_done(run.info)
             files = fetch(client, run.info, delivery, wanted(run.info, ""))
+            facts = run.facts()
     except KeyboardInterrupt:
         say(f"\numbra: stopped; nothing was written to {out}")
         raise
-    report(run.info, files, as_json)
+    report(run.info, files, facts, as_json)
 
 
 def usable(client: Client) -> None:
@@ -123,12 +124,15 @@ def usable(client: Client) -> None:
             raise UmbraError(Code.BAD_INPUT, device.message.removeprefix("camera: connect: "))
 
 
-def report(info: RunInfo, files: Iterable[Path], as_json: bool) -> None:
-    """Say what was written."""
+def report(info: RunInfo, files: Iterable[Path], facts: Mapping[str, Any], as_json: bool) -> None:
+    """Say what was written, and what is to be known of it."""
     if as_json:
         print_json(Fetched(run=info, files=tuple(map(str, files))))
         return
-    say(f"separated {frames(info)}")
+    good = facts.get("good", {}).get("fraction")
+    share = f", {good:.1%} of the pixels without a flag" if isinstance(good, float) else ""
+    say(f"separated {frames(info)}{share}")
+    tell(facts)
     for file in files:
         print(file)
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from protocol.cli.exits import Exit
 from protocol.cli.link import Json, Keys, Rig, RunId, connect
@@ -71,6 +71,16 @@ def conclude(info: RunInfo, *, quiet: bool = False) -> Exit:
     elif not quiet:
         say(f"run {info.id} done: {frames(info)}")
     return code
+
+
+def tell(facts: Mapping[str, Any]) -> None:
+    """Say what a run found out: a measurement's figures and commands, and advice of any run."""
+    for name, value in facts.get("figures", ()):
+        say(f"{name}: {value}")
+    for line in facts.get("advice", ()):
+        say(f"advice: {line}")
+    for command in facts.get("commands", ()):
+        say(f"  {command}")
 
 
 def must_be_done(info: RunInfo) -> None:
