@@ -39,6 +39,16 @@ _PLACE = {"shift_x", "shift_y", "shift", "phase", "seed", "index", "inverted"}
 Sample = NDArray[np.float32]
 
 
+def expected_level(image: NDArray[np.uint8]) -> float | None:
+    """The share of white's light that the scene as a whole gets under an image (h, w) uint8; None
+    where it is too coarse to say: parts of the scene would get more of it than others."""
+    height, width = (side // _BLOCKS * _BLOCKS for side in image.shape)
+    blocks = image[:height, :width].reshape(_BLOCKS, height // _BLOCKS, _BLOCKS, width // _BLOCKS)
+    means = blocks.mean(axis=(1, 3)) / 255
+    level = float(means.mean())
+    return level if float(np.abs(means - level).max()) <= _EVEN else None
+
+
 class Proof:
     """Judges frame after frame of one scan; a frame that failed is forgotten, not compared with."""
 
@@ -49,36 +59,33 @@ class Proof:
         self._family: object = None
         self._differences: deque[float] = deque(maxlen=16)
 
-    def problem(self, pixels: NDArray[Any], step: Expose, image: NDArray[np.uint8] | None) -> str:
+    def problem(self, pixels: NDArray[Any], step: Expose, expected: float | None) -> str:
         """Why the frame (H, W) or (H, W, 3) cannot be of this step; "" if it can.
 
-        `image` is what the projector was given, (h, w); None for a source that is off.
+        `expected` is the `expected_level` of what the projector was given.
         """
         sample = _sample(pixels)
         level = float(sample.mean())
-        found = self._problem(sample, level, step, image)
+        found = self._problem(sample, level, step, expected)
         if not found:
             self._remember(sample, level, step)
         return found
 
-    def _problem(
-        self, sample: Sample, level: float, step: Expose, image: NDArray[np.uint8] | None
-    ) -> str:
+    def _problem(self, sample: Sample, level: float, step: Expose, expected: float | None) -> str:
         if step.lighting is Lighting.WHITE:
             if self._black is not None and not _brighter(sample, self._black):
                 return "the white frame is not brighter than the black one: the projector is late"
             return ""
         if step.lighting is not Lighting.PATTERN:
             return ""
-        return self._of_level(level, image) or self._of_repetition(sample, step)
+        return self._of_level(level, expected) or self._of_repetition(sample, step)
 
-    def _of_level(self, level: float, image: NDArray[np.uint8] | None) -> str:
+    def _of_level(self, level: float, expected: float | None) -> str:
         """Compare with the levels of black and white, where the scan has taken both."""
-        if self._black is None or self._white is None or image is None or not _even(image):
+        if self._black is None or self._white is None or expected is None:
             return ""
         black = float(self._black.mean())
         share = (level - black) / (self._white - black)
-        expected = float(image.mean()) / 255
         if abs(share - expected) <= _OFF_LEVEL:
             return ""
         return (
@@ -124,14 +131,6 @@ def _brighter(white: Sample, black: Sample) -> bool:
     more = white - black
     standard_error = float(more.std()) / float(more.size) ** 0.5
     return bool(float(more.mean()) > _BRIGHTER * standard_error)
-
-
-def _even(image: NDArray[np.uint8]) -> bool:
-    """Whether a pattern is fine enough for every part of the scene to get about the same light."""
-    height, width = (side // _BLOCKS * _BLOCKS for side in image.shape)
-    blocks = image[:height, :width].reshape(_BLOCKS, height // _BLOCKS, _BLOCKS, width // _BLOCKS)
-    means = blocks.mean(axis=(1, 3)) / 255
-    return float(np.abs(means - means.mean()).max()) <= _EVEN
 
 
 def _family(step: Expose) -> object:

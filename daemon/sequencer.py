@@ -32,7 +32,7 @@ from daemon.control import Control
 from daemon.devicethread import Session, Stuck
 from daemon.motion import Mover
 from daemon.patterns import predistorted, render
-from daemon.proof import Proof
+from daemon.proof import Proof, expected_level
 from daemon.recorder import Exposed, Recorder
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Buffer, Ring
@@ -78,7 +78,7 @@ class _Exposure:
     sub: int
     lit_ns: int  # from when the light was the pattern's
     dark_ns: int  # until when it was; 0: it still is
-    image: NDArray[np.uint8] | None  # what the projector was given
+    level: float | None  # of the scene under what the projector was given, as far as it is known
     end_ns: int  # when the camera said that the exposure would end
     buffer: Buffer
     grab: Future[Frame]
@@ -117,7 +117,7 @@ class Sequencer:
         self._acquisition: Acquisition | None = None
         self._taken = 0
         self._pending: _Exposure | None = None
-        self._drawn: tuple[AnyPattern, NDArray[np.uint8]] | None = None
+        self._drawn: tuple[AnyPattern, NDArray[np.uint8], float | None] | None = None
         calibration = method.bench.calibration or {}
         self._latency_ns = round(float(calibration.get("latency_s", 0.0)) * NS)
         self._tone: list[int] | None = calibration.get("tone")
@@ -126,7 +126,7 @@ class Sequencer:
         self._last_sequence: int | None = None
         self._lit: Expose | None = None
         self._lit_ns = 0
-        self._lit_image: NDArray[np.uint8] | None = None
+        self._lit_level: float | None = None
         self._looks = Proof() if method.looked_at else None
         self.reason = "all steps were exposed"
 
@@ -226,20 +226,22 @@ class Sequencer:
         elif step.pattern is None:
             self._projector.call(lambda p: p.safe(), SAFE_S, self._session)
             self._lit_ns = self._clock.now_ns() + self._latency_ns
-            self._lit_image = None
+            self._lit_level = None
         else:
-            image = self._lit_image = self._image(step)
+            image, self._lit_level = self._image(step)
             sent = image if self._tone is None else predistorted(image, self._tone)
             flipped = self._projector.call(lambda p: p.show(sent), SHOW_S, self._session)
             self._lit_ns = flipped + self._latency_ns
 
-    def _image(self, step: Expose) -> NDArray[np.uint8]:
+    def _image(self, step: Expose) -> tuple[NDArray[np.uint8], float | None]:
+        """What to show, and how bright the scene must then be."""
         assert self._projector is not None
         assert step.pattern is not None
         if self._drawn is None or self._drawn[0] != step.pattern:
             info = self._projector.device.info()
-            self._drawn = (step.pattern, render(step.pattern, info.width, info.height))
-        return self._drawn[1]
+            image = render(step.pattern, info.width, info.height)
+            self._drawn = (step.pattern, image, expected_level(image))
+        return self._drawn[1:]
 
     def _draw_ahead(self, index: int) -> None:
         """Draw the next pattern while the exposure lasts."""
@@ -264,7 +266,7 @@ class Sequencer:
             lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, self._session
         )
         return _Exposure(
-            index, step, sub, self._lit_ns, 0, self._lit_image, end_ns, buffer, grab, attempt
+            index, step, sub, self._lit_ns, 0, self._lit_level, end_ns, buffer, grab, attempt
         )
 
     def _frame_deadline(self) -> float:
@@ -340,7 +342,7 @@ class Sequencer:
             return f"the exposure ended {late:.2f} ms after its pattern was taken down"
         if self._looks is None:
             return ""
-        return self._looks.problem(frame.pixels, exposure.step, exposure.image)
+        return self._looks.problem(frame.pixels, exposure.step, exposure.level)
 
     # ------------------------------------------------------------ video steps
 
