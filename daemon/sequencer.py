@@ -445,7 +445,8 @@ class Sequencer:
             log.warning("no frame", problem=str(error), silent=self._silent)
             return None
         self._silent = 0
-        if not 0 <= frame.sequence - (self._last_sequence or frame.sequence) <= _GAP:
+        last = frame.sequence if self._last_sequence is None else self._last_sequence
+        if not 0 <= frame.sequence - last <= _GAP:
             raise DeviceGarbled(
                 self._camera.device.name,
                 "grab",

@@ -70,7 +70,7 @@ def test_global_light_varies_little_with_the_patch_but_for_the_marble(daemon: Da
     text = text.replace("width = 128\nheight = 96", "width = 1024\nheight = 768")
     text = text.replace("width = 160\nheight = 120", "width = 512\nheight = 384")
     daemon.config.write_text(text.replace("time_scale = 4", "time_scale = 10"))
-    points = {"wall": (345, 150), "candle": (108, 227), "marble": (264, 240), "water": (437, 260)}
+    points = {"wall": (324, 107), "candle": (108, 227), "marble": (264, 240), "water": (437, 260)}
     with daemon.start() as rig:
         rig.scan(umbra.CalibrateLeak(sizes=(3, 8))).wait(60)
         run = rig.scan(
