@@ -6,7 +6,6 @@ from typing import ClassVar
 
 from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import RankedMethod
-from daemon.separation.estimator import Estimator
 from protocol import patterns
 from protocol.scans import RandomBinary
 
@@ -47,7 +46,3 @@ class RandomBinaryMethod(RankedMethod[RandomBinary]):
     def counted(self) -> str:
         """See `PatternMethod`."""
         return f"{super().counted()} (set --patterns)"
-
-    def estimator(self) -> Estimator:
-        """See `Method`."""
-        return self.ranking()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -106,12 +107,7 @@ class PeaksAndValleys:
         saturated = self._reduced(self._saturated.astype(np.float32)) > 0
         deviation = self._deviation(picture, brightest)
         planes = self._stated(deviation, self._deviation(picture, darkest))
-        plain = Response(
-            self._response.full_scale,
-            self._response.black,
-            self._response.tone,
-            self._response.saturation,
-        )
+        plain = replace(self._response, bayer="")
         return finish(
             direct,
             indirect,
