@@ -42,8 +42,8 @@ from daemon.separation.noise import Noise
 from daemon.separation.radiometry import FrameMean, Plane, Response
 
 CROSSOVER = 0.01
-"""q where no calibration tells it, of full scale: read and shot noise are alike there. Weights for
-a q that is quite wrong cost a tenth of the deviation."""
+"""q where no calibration tells it, of full scale: read and shot noise are alike there. A q that is
+quite wrong costs 8 % more deviation for shot noise alone, 27 % for none (exposures 1, 4, 16)."""
 
 _OFF = 0.03  # of the ratio of two exposures: from here it is said
 
@@ -96,7 +96,7 @@ class Radiance(Response):
 
     factors: tuple[float, ...] = (1.0,)
     average: int = 1
-    noise: ExposureNoise | None = field(default=None, compare=False)
+    meter: ExposureNoise | None = field(default=None, compare=False)
     crossover: float = 1.0
 
     @classmethod
@@ -105,7 +105,7 @@ class Radiance(Response):
         response: Response,
         factors: Sequence[float],
         average: int,
-        noise: ExposureNoise,
+        meter: ExposureNoise,
         crossover: float,
     ) -> Radiance:
         """For frames of a camera merged from so many exposures of `average` frames."""
@@ -114,7 +114,7 @@ class Radiance(Response):
             **given,
             factors=tuple(sorted(factors)),
             average=average,
-            noise=noise,
+            meter=meter,
             crossover=crossover,
         )
 
@@ -159,8 +159,8 @@ class Radiance(Response):
         the rounding of counts alone."""
         light = np.maximum(np.asarray(counts, dtype=np.float32), np.float32(0.0))
         sensor = Sensor(0.0, 0.0)
-        if noise is not None and self.noise is not None:
-            sensor = self.noise.sensor()
+        if noise is not None and self.meter is not None:
+            sensor = self.meter.sensor()
         camera = self.camera
         limit = _limit(self)
         colours = light.max(axis=2, keepdims=True) if light.ndim == 3 else light  # see `spoiled`
