@@ -155,5 +155,5 @@ class ExposureNoise:
             square = float(np.sum(levels**2 / samples))
             if square > 0:
                 off = float(np.sum(middles * levels / samples)) / square
-                found[short, long] = long / short * (1.0 - off)
+                found[short, long] = long / short / max(1.0 + off, 1e-9)
         return found
