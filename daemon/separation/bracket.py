@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -109,9 +109,12 @@ class Radiance(Response):
         crossover: float,
     ) -> Radiance:
         """For frames of a camera merged from so many exposures of `average` frames."""
-        given = {one.name: getattr(response, one.name) for one in fields(Response)}
         return cls(
-            **given,
+            full_scale=response.full_scale,
+            black=response.black,
+            tone=response.tone,
+            saturation=response.saturation,
+            bayer=response.bayer,
             factors=tuple(sorted(factors)),
             average=average,
             meter=meter,
@@ -136,7 +139,7 @@ class Radiance(Response):
     @property
     def camera(self) -> Response:
         """The camera's own response."""
-        return Response(**{one.name: getattr(self, one.name) for one in fields(Response)})
+        return Response(self.full_scale, self.black, self.tone, self.saturation, self.bayer)
 
     def linear(self, counts: NDArray[Any]) -> Plane:
         """Merged frames are linear."""

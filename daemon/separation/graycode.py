@@ -148,9 +148,7 @@ class GrayCodeDecoder:
             "global_std": global_std,
             "stripe": stripe,
         }
-        limit = np.float32(SIGNIFICANT) * _grey(deviation)
-        for axis, code in self._codes.items():
-            planes["column" if axis == "x" else "row"] = code.decode(limit)
+        planes.update(self.coordinates(np.float32(SIGNIFICANT) * _grey(deviation)))
         return finish(
             direct,
             indirect,
@@ -180,6 +178,14 @@ class GrayCodeDecoder:
                 "advice": advice,
             },
         )
+
+    def coordinates(self, limit: Plane) -> dict[str, Plane]:
+        """`column` and `row` (H, W) in projector pixels, as far as they are coded; NaN where a
+        coarse stripe differs from its inverse by less than `limit` (H, W, linear counts)."""
+        return {
+            "column" if axis == "x" else "row": code.decode(limit)
+            for axis, code in self._codes.items()
+        }
 
     def _finest(self, deviation: Plane) -> tuple[Plane, NDArray[np.uint16]]:
         """|P - I| of the finest stripes that keep their contrast, and their width (H, W)."""
