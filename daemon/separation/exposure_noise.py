@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 ROUNDING = 1.0 / 12.0
 """Variance of a count's rounding error."""
 
-_SAMPLE = 3  # each third row and column: all colours of a mosaic
+_SAMPLES = 30_000  # compared of a pattern, on an odd grid: all colours of a mosaic
 _LEVELS = 24
 _ENOUGH = 50  # samples of a level
 _OUTLIER = 4.0  # deviations
@@ -83,9 +83,11 @@ class ExposureNoise:
         """Compare two exposures of one pattern; `names` are what they should be."""
         self._sensor = None
         ratio = short.factor / long.factor
-        good = ~(short.saturated | long.saturated)[::_SAMPLE, ::_SAMPLE]
-        level = (long.light[::_SAMPLE, ::_SAMPLE] * np.float32(ratio))[good]
-        apart = short.light[::_SAMPLE, ::_SAMPLE][good] - level
+        step = int((short.light.size / _SAMPLES) ** 0.5) | 1
+        grid = slice(None, None, step), slice(None, None, step)
+        good = ~(short.saturated[grid] | long.saturated[grid])
+        level = long.light[grid][good] * np.float32(ratio)
+        apart = short.light[grid][good] - level
         top = self._response.linear_full_scale * ratio
         root = np.sqrt(np.maximum(level, 0.0) * np.float32(1.0 / top))  # even in what noise does
         bins = np.minimum(root * np.float32(_LEVELS), _LEVELS - 1).astype(np.intp)
