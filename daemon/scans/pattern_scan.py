@@ -203,6 +203,7 @@ class RankedMethod(PatternMethod[P]):
                 leakage=self.leakage,
                 average=self.spec.average,
                 levels=self.levels,
+                weights=self.weights(),
             )
         return TopK(
             self.response,

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import RankedMethod
 from daemon.separation.estimator import Estimator
+from daemon.separation.residue import patch_weights
 from protocol import patterns
 from protocol.scans import RandomBinary
 
@@ -47,6 +51,10 @@ class RandomBinaryMethod(RankedMethod[RandomBinary]):
     def counted(self) -> str:
         """See `PatternMethod`."""
         return f"{super().counted()} (set --patterns)"
+
+    def weights(self) -> NDArray[np.complex128]:
+        """See `RankedMethod`."""
+        return patch_weights(self.spec.patterns)
 
     def estimator(self) -> Estimator:
         """See `Method`."""

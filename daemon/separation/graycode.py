@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import SIGNIFICANT, Judgement, finish
+from daemon.separation.coordinates import mirrored_coordinates
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
@@ -27,6 +28,13 @@ FINE = 4
 
 _KEPT = 0.95
 """A stripe resolves a pixel that has at least this part of the best contrast."""
+
+
+_SEEN = 2
+"""The bit by whose stripes, 8 px wide, a mirror's finer ones are told."""
+
+_DIRECT = 0.25
+"""Of the light: with less that is direct, a pixel's coordinate says nothing of mirrors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +158,14 @@ class GrayCodeDecoder:
         limit = np.float32(SIGNIFICANT) * _grey(deviation)
         for axis, code in self._codes.items():
             planes["column" if axis == "x" else "row"] = code.decode(limit)
+        told = mirrored_coordinates(
+            {name: planes[name] for name in ("column", "row") if name in planes},
+            self._strength(contrast, pair, deviation),
+            self._stripes(),
+        )
+        flags = bits(told.mirrored, Quality.RESIDUE)
+        if moved is not None:
+            flags |= moved
         return finish(
             direct,
             indirect,
@@ -161,7 +177,7 @@ class GrayCodeDecoder:
                 total=np.float32(SIGNIFICANT) * global_std,
                 deviation=deviation,
             ),
-            flags=moved,
+            flags=flags,
             planes=planes,
             facts={
                 "estimator": "finest stripes",
@@ -176,9 +192,23 @@ class GrayCodeDecoder:
                 },
                 **self._references.facts(total.source),
                 **steady,
-                "advice": advice,
+                **told.facts,
+                "advice": told.advice + advice,
             },
         )
+
+    def _strength(self, contrast: Plane, pair: Plane, deviation: Plane) -> Plane:
+        """Contrast of the stripes by its noise; 0 where little light is direct, for there the
+        coarse bits were told by global light."""
+        strong = _grey(contrast) / np.maximum(_grey(deviation), np.float32(1e-6))
+        return np.where(_grey(contrast) > np.float32(_DIRECT) * _grey(pair), strong, np.float32(0))
+
+    def _stripes(self) -> Plane | None:
+        """P - I of the stripes of each axis that are fine and yet resolved, multiplied."""
+        found = [_grey(d) for key, d in self._difference.items() if key[1] == _SEEN]
+        if len(found) < len(self._codes):
+            return None
+        return found[0] if len(found) == 1 else np.sign(found[0]) * found[1]
 
     def _finest(self, deviation: Plane) -> tuple[Plane, NDArray[np.uint16]]:
         """|P - I| of the finest stripes that keep their contrast, and their width (H, W)."""

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from daemon.separation import correspondence
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
-from daemon.separation.handedness import reversed_pattern, strength
+from daemon.separation.handedness import strength
 from daemon.separation.noise import Noise
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
+from daemon.separation.residue import mirrored
 from daemon.separation.scan_noise import ResidualNoise
 from daemon.separation.steadiness import compare
 
@@ -107,8 +108,9 @@ class LeastSquares:
         quality = np.zeros(direct.shape[:2], dtype=np.uint16)
         if len(solved) > 1:
             quality |= bits(_disagree(solved), Quality.DISAGREE)
-        if self._periods:
-            quality |= bits(self._mirrored(ready[0], noise), Quality.RESIDUE)
+        reflected, told = self._mirrored(ready[0], noise)
+        if reflected is not None:
+            quality |= bits(reflected, Quality.RESIDUE)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": np.sqrt(direct_var),
             "global_std": np.sqrt(global_var),
@@ -134,7 +136,7 @@ class LeastSquares:
             **self._references.facts(
                 self._references.total(ready[0].solve()[0], self._leakage).source
             ),
-            "mirrors_looked_for": bool(self._periods),
+            **told,
             **steady,
             "misfit": None if misfit is None else round(misfit, 3),
             "advice": _advice(misfit, self._noise.distortion, disagreeing) + advice,
@@ -219,14 +221,17 @@ class LeastSquares:
         total_var: Plane = variance * of_total
         return direct, indirect, direct_var, direct_var + total_var
 
-    def _mirrored(self, fit: _Fit, noise: Noise | None) -> NDArray[np.bool_]:
-        """Where the phase runs against the picture's."""
+    def _mirrored(
+        self, fit: _Fit, noise: Noise | None
+    ) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
+        """Where the phase runs against the picture's, or changes faster: see `residue`."""
         _, cosine, sine = fit.solve()
         wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
         if wave.ndim == 3:
             wave = np.asarray(wave.sum(axis=2), dtype=np.complex64)
         deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
-        return reversed_pattern([wave], strength([wave], deviation))
+        even = bool(self._periods)
+        return mirrored([wave], strength([wave], deviation), turning=even, smooth=even)
 
     def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
         mean, _, _ = fit.solve()
