@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from daemon import patterns
 from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import RankedMethod
-from daemon.separation.estimator import Estimator
 from daemon.separation.handedness import shift_weights
 from protocol.patterns import Checker
 from protocol.scans import Checkerboard
@@ -39,10 +38,6 @@ class CheckerboardMethod(RankedMethod[Checkerboard]):
     def weights(self) -> NDArray[np.complex128] | None:
         """See `RankedMethod`."""
         return shift_weights(self._shifts, 2.0 * self.spec.checker)
-
-    def estimator(self) -> Estimator:
-        """See `Method`."""
-        return self.ranking()
 
 
 def _check_coverage(spec: Checkerboard) -> None:

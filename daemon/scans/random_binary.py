@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import RankedMethod
-from daemon.separation.estimator import Estimator
 from daemon.separation.residue import patch_weights
 from protocol import patterns
 from protocol.scans import RandomBinary
@@ -55,7 +54,3 @@ class RandomBinaryMethod(RankedMethod[RandomBinary]):
     def weights(self) -> NDArray[np.complex128]:
         """See `RankedMethod`."""
         return patch_weights(self.spec.patterns)
-
-    def estimator(self) -> Estimator:
-        """See `Method`."""
-        return self.ranking()

@@ -7,6 +7,7 @@ from typing import ClassVar
 from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import PatternMethod
 from daemon.separation.estimator import Estimator
+from daemon.separation.radiometry import Response
 from daemon.separation.single import PeaksAndValleys
 from protocol.patterns import Stripes
 from protocol.scans import SingleImage
@@ -47,10 +48,11 @@ class SingleImageMethod(PatternMethod[SingleImage]):
         """α of the stripes: as asked for, else their own on this projector, else a half."""
         return self.lit_fraction_of(self._patterns[:1])
 
-    def estimator(self) -> Estimator:
-        """See `Method`."""
+    def separator(self, response: Response, average: int) -> Estimator:
+        """See `PatternMethod`."""
+        del average  # frames are averaged until the last of a pattern
         return PeaksAndValleys(
-            self.response,
+            response,
             lit_fraction=self.lit_fraction,
             leakage=self.leakage,
             window=self.spec.window,

@@ -9,6 +9,7 @@ from daemon.scans.pattern_scan import PatternMethod
 from daemon.separation.estimator import Estimator
 from daemon.separation.light_model import complement_determinants
 from daemon.separation.pair import ComplementPair
+from daemon.separation.radiometry import Response
 from protocol.patterns import Checker
 from protocol.scans import TwoImage
 
@@ -42,11 +43,11 @@ class TwoImageMethod(PatternMethod[TwoImage]):
         """See `PatternMethod`."""
         return "a pattern and its complement"
 
-    def estimator(self) -> Estimator:
-        """See `Method`."""
+    def separator(self, response: Response, average: int) -> Estimator:
+        """See `PatternMethod`."""
         return ComplementPair(
-            self.response,
+            response,
             lit_fraction=self.lit_fraction,
             leakage=self.leakage,
-            average=self.spec.average,
+            average=average,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -109,12 +110,7 @@ class PeaksAndValleys:
         deviation = self._deviation(picture, brightest)
         planes = self._stated(deviation, self._deviation(picture, darkest))
         mirrored = self._mirrored(picture)
-        plain = Response(
-            self._response.full_scale,
-            self._response.black,
-            self._response.tone,
-            self._response.saturation,
-        )
+        plain = replace(self._response, bayer="")
         return finish(
             direct,
             indirect,

@@ -206,20 +206,21 @@ class LeastSquares:
         """Direct, global and their variances from one frequency."""
         mean, cosine, sine = fit.solve()
         b = self._leakage
-        sigma = self._response.deviation(noise, self._response.counts(mean))
-        mean_var, wave_var = fit.variances()
         power = cosine * cosine + sine * sine
+        of_mean, of_wave = self._response.wave_deviations(noise, mean, np.sqrt(power))
+        mean_var, wave_var = fit.variances()
         if self._noise.measured:
             # |B| of noise alone is not 0: to first order its square is too large by one variance.
-            power = np.maximum(power - np.float32(wave_var) * sigma * sigma, 0)
+            power = np.maximum(power - np.float32(wave_var) * of_wave * of_wave, 0)
         amplitude: Plane = np.sqrt(power)
         direct: Plane = amplitude * np.float32(2.0 * gain / (1.0 - b))
         total = self._references.total(mean, b)
         indirect: Plane = total.light - direct
-        variance = sigma * sigma
-        direct_var: Plane = variance * np.float32(wave_var * (2.0 * gain / (1.0 - b)) ** 2)
+        direct_var: Plane = np.square(of_wave) * np.float32(
+            wave_var * (2.0 * gain / (1.0 - b)) ** 2
+        )
         of_total = np.asarray(mean_var * total.of_half + total.of_frame, dtype=np.float32)
-        total_var: Plane = variance * of_total
+        total_var: Plane = np.square(of_mean) * of_total
         return direct, indirect, direct_var, direct_var + total_var
 
     def _mirrored(

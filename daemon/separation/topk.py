@@ -226,7 +226,7 @@ class TopK:
         if self._noise.measured:
             return blur, None
         sigma = ratios * steps / np.interp(np.log(ratios), np.log(RATIOS), models[blur].step)
-        slope = self._response.deviation(None, self._response.counts(light)) * 12.0**0.5
+        slope = self._response.slope(self._response.counts(light))
         levels = self._response.counts(light).astype(np.float64)
         return blur, Noise(
             tuple(levels.tolist()),
