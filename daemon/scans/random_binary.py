@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import RankedMethod
+from daemon.scans.pattern_scan import FINE_PX, RankedMethod
 from daemon.separation.residue import patch_weights
 from protocol import patterns
 from protocol.scans import RandomBinary
@@ -42,6 +42,11 @@ class RandomBinaryMethod(RankedMethod[RandomBinary]):
                 for index in range(spec.patterns)
             ],
         )
+
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return self.spec.patch <= FINE_PX
 
     def described(self) -> str:
         """See `PatternMethod`."""

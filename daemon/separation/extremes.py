@@ -21,6 +21,7 @@ from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import NOT_SHIFTS, of_shifts
 from daemon.separation.scan_noise import ScanNoise
+from daemon.separation.steadiness import HALF, compare
 
 
 class MaxMin:
@@ -125,7 +126,18 @@ class MaxMin:
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
         planes, bias = self._stated(brightest, darkest)
         deviation = self._noise.deviation(brightest)
+        moved: NDArray[np.uint16] | None = None
+        steady: dict[str, Any] = {}
+        advice: list[str] = []
+        if abs(self._alpha - 0.5) < HALF:
+            middle = (brightest + darkest) * np.float32(0.5)
+            moved, steady, advice = compare(
+                self._references, middle, deviation, self._leakage, ranked=True
+            )
         mirrored, told, as_declared = of_shifts(self._waves, deviation)
+        flags = np.zeros(direct.shape[:2], dtype=np.uint16) if moved is None else moved
+        if mirrored is not None:
+            flags |= bits(mirrored, Quality.RESIDUE)
         return finish(
             direct,
             indirect,
@@ -133,7 +145,7 @@ class MaxMin:
             response=self._response,
             brightest=brightest,
             saturated=saturated,
-            flags=None if mirrored is None else bits(mirrored, Quality.RESIDUE),
+            flags=flags,
             judgement=Judgement.of_extremes(deviation, self._patterns),
             facts={
                 "estimator": "maxmin",
@@ -144,7 +156,8 @@ class MaxMin:
                 "noise_from": self._noise.source,
                 **bias,
                 **told,
-                "advice": [] if as_declared else [NOT_SHIFTS],
+                **steady,
+                "advice": ([] if as_declared else [NOT_SHIFTS]) + advice,
                 **self._references.facts(source),
             },
         )

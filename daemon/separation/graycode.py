@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from daemon.separation.coordinates import mirrored_coordinates
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
+from daemon.separation.frameset import PairSums
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
@@ -73,6 +74,7 @@ class GrayCodeDecoder:
         self._whole: Plane | None = None  # sum of P + I over all pairs
         self._brightest: Plane | None = None
         self._pairs = 0
+        self._sums = PairSums()
         self._saturated: NDArray[np.bool_] | None = None
         self._unused = 0
 
@@ -121,6 +123,7 @@ class GrayCodeDecoder:
         self._codes[image.axis].add(image.bit, _grey(difference))
         if image.bit < FINE:
             self._difference[key] = difference
+        self._sums.add(whole)
         brighter = np.maximum(shown, inverse)
         if self._whole is None or self._brightest is None:
             self._whole, self._brightest = whole, brighter
@@ -163,6 +166,7 @@ class GrayCodeDecoder:
             self._strength(contrast, pair, deviation),
             self._stripes(),
         )
+        sums, unequal = self._sums.told(float(np.median(deviation)))
         flags = bits(told.mirrored, Quality.RESIDUE)
         if moved is not None:
             flags |= moved
@@ -193,7 +197,8 @@ class GrayCodeDecoder:
                 **self._references.facts(total.source),
                 **steady,
                 **told.facts,
-                "advice": told.advice + advice,
+                **sums,
+                "advice": unequal + told.advice + advice,
             },
         )
 

@@ -25,12 +25,11 @@ from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import NOT_SHIFTS, of_shifts
 from daemon.separation.scan_noise import ScanNoise
-from daemon.separation.steadiness import compare
+from daemon.separation.steadiness import HALF, compare
 
 KEEP = 5
 """Samples kept at each end; a checkerboard's 25 shifts light every pixel wholly in 9 or more."""
 
-_HALF = 0.02  # lit fractions so near to a half are one
 _GROUPS = 8
 _FINE = 64  # steps between tabulated ratios
 _TINY = np.float32(1e-6)
@@ -133,7 +132,7 @@ class TopK:
         moved: NDArray[np.uint16] | None = None
         steady: dict[str, Any] = {}
         advice: list[str] = []
-        if abs(self._alpha - 0.5) < _HALF:
+        if abs(self._alpha - 0.5) < HALF:
             middle = (lit + unlit) * np.float32(0.5)
             moved, steady, advice = compare(self._references, middle, deviation, b, ranked=True)
         ambient, source = self._references.ambient(lit, unlit, self._alpha, b)
