@@ -34,7 +34,7 @@ from daemon.separation.estimator import NotYet, Result
 from daemon.sequencer import CALL_S, Behind, Sequencer
 from daemon.store import RunFolder, Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
-from drivers.base import CameraInfo, CameraSettings, DeviceError
+from drivers.base import Camera, CameraInfo, CameraSettings, DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
 from protocol.messages import End, Progress, RunState
@@ -88,6 +88,7 @@ class Course:
         self._room_seen = 0.0
         self._timings: dict[str, float] = {}
         self._exposure_s = 0.0
+        self._own_us: float | None = None  # the run's exposure
         self._reason = ""  # why the steps ended
         self._broke_off = ""  # when an interrupted run took its last frame
         self.beat = time.monotonic()
@@ -168,6 +169,7 @@ class Course:
                 # Whoever revoked the session has sent the devices there already: this waits.
                 futures = self._rig.make_safe(halt=not session.ended.is_set())
                 self._rig.safe_within(futures, SAFE_S)
+                self._expose_as_before()
                 self._rig.leave(session)
         self._close(end)
         return end
@@ -222,6 +224,19 @@ class Course:
         finally:
             frames.close()
 
+    def _expose_as_before(self) -> None:
+        """The camera has the run's exposure again, whatever step the run ended in."""
+        own = CameraSettings(exposure_us=self._own_us)
+
+        def restore(camera: Camera) -> None:
+            if own.exposure_us not in (None, camera.settings().exposure_us):
+                camera.configure(own)
+
+        try:
+            self._rig.camera.call(restore, CALL_S)
+        except DeviceError as error:
+            log.warning("the camera may keep the exposure of the last step", problem=str(error))
+
     def _sequence(
         self,
         session: Session,
@@ -272,6 +287,7 @@ class Course:
             wanted = replace(wanted, frame_rate_hz=spec.frame_rate_hz)
         camera = self._rig.camera
         in_force = camera.call(lambda c: c.configure(wanted), CALL_S, session)
+        self._own_us = in_force.exposure_us
         self._exposure_s = (in_force.exposure_us or 0.0) * 1e-6
         return {
             **{name: value for name, value in asdict(in_force).items() if value is not None},
