@@ -147,12 +147,13 @@ class GrayCodeDecoder:
         total = self._references.total(half, b)
         moved, steady, advice = compare(self._references, half, deviation, b)
         indirect: Plane = total.light - direct
-        direct_std = deviation * np.float32(np.sqrt(2.0) / (1.0 - b))
-        share = np.asarray(
-            total.of_half * np.float32(0.5 / self._pairs) + total.of_frame * self._average,
-            dtype=np.float32,
-        )
-        global_std: Plane = np.sqrt(direct_std**2 + deviation**2 * share)
+        step = contrast * np.float32(0.5)
+        pair_var = np.square(self._noise.deviation(half + step))
+        pair_var += np.square(self._noise.deviation(half - step))
+        direct_std: Plane = np.sqrt(pair_var) * np.float32(1.0 / (1.0 - b))
+        global_var = total.of_references(self._noise.deviation) * np.float32(self._average)
+        global_var += pair_var * np.asarray(total.of_half * (0.25 / self._pairs), np.float32)
+        global_std: Plane = np.sqrt(direct_std**2 + global_var)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": direct_std,
             "global_std": global_std,
