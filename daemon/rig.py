@@ -141,12 +141,14 @@ class Rig:
         """
         self.require_ready()
         projector, stage = self.projector, self.stage
+        settings = self.camera.device.settings()
         return Bench(
             camera=self.camera.device.info(),
             projector=projector.device.info() if projector else None,
             stage=stage.device.info() if stage else None,
             lights=tuple(self.lights),
-            exposure_us=self.camera.device.settings().exposure_us,
+            exposure_us=settings.exposure_us,
+            gain=settings.gain,
             calibration=calibration,
         )
 

@@ -23,6 +23,7 @@ Value = bool | int | float | str
 # Where a camera has both names, the old one is its own and the other an alias for new programs.
 EXPOSURE = ("ExposureTimeAbs", "ExposureTime")
 GAIN = ("GainAbs", "Gain", "GainRaw")
+GAIN_DB = ("GainAbs", "Gain")  # raw steps are each vendor's own
 RATE = ("AcquisitionFrameRateAbs", "AcquisitionFrameRate")
 RATE_ENABLE = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
 RESULTING_RATE = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
@@ -289,12 +290,15 @@ class SfncCamera(StreamingCamera):
         )
         exposure = nodes.first(EXPOSURE)
         low, high, _ = nodes.range(exposure) if exposure else (0.0, 0.0, 0.0)
+        gain = nodes.first(GAIN)
         info = CameraInfo(
             width=width,
             height=height,
             pixel_format=pixel_format,
             black_level=self.options.black_level,
             exposure_range_us=(low, high),
+            gain_range=nodes.range(gain)[:2] if gain else None,
+            gain_unit="dB" if gain in GAIN_DB else "",
             max_rate_hz=nodes.number(RESULTING_RATE) or settings.frame_rate_hz or 0.0,
             readout_s=(nodes.number(READOUT) or 0.0) / 1e6,
             triggers=self._triggers(nodes),

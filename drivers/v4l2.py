@@ -325,6 +325,7 @@ class V4l2Camera(StreamingCamera):
             pixel_format=pixel_format,
             black_level=options.black_level,
             exposure_range_us=limits,
+            gain_range=(float(gain.minimum), float(gain.maximum)) if gain else None,
             max_rate_hz=rate,
             triggers=(*software, *hardware, "none"),
         )

@@ -54,6 +54,11 @@ class UmbraError(Exception):
         self.message = message
         self.where = where
 
+    def __str__(self) -> str:
+        """The message, after the field that it is about: "spec.checker: Expected `int` >= 1"."""
+        field = self.where.removeprefix("$").removeprefix(".").removeprefix("command.")
+        return f"{field}: {self.message}" if field else self.message
+
     @property
     def info(self) -> ErrorInfo:
         """The same error as it travels."""

@@ -38,6 +38,7 @@ class Bench:
     stage: StageInfo | None = None
     lights: tuple[str, ...] = ()
     exposure_us: float | None = None  # of the camera as it is set
+    gain: float | None = None  # the same
     calibration: Mapping[str, Any] | None = None  # values that apply: see daemon.calibration
 
 

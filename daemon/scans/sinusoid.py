@@ -59,6 +59,7 @@ class SinusoidMethod(PatternMethod[Sinusoid]):
             size=along,
             weave=self.spec.weave,
             axis=self.spec.axis,
+            blur_px=(self.bench.calibration or {}).get("optics_blur_px"),
         )
 
 

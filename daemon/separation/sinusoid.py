@@ -9,12 +9,14 @@ whichever are missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import log
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import correspondence
+from daemon.separation.blur import of_wave
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import reversed_pattern, strength
@@ -46,7 +48,8 @@ class LeastSquares:
 
     `phases[i]` is pattern i's (frequency, δ in radians). Planes: `direct_std`, `global_std` (as the
     components), `phase` (H, W) in 0..2π of the first frequency, and `column` or `row` (H, W) in
-    projector pixels where `periods` say how to get it.
+    projector pixels where `periods` say how to get it. `blur_px`: the optics' as calibrated, for
+    where the frames do not tell it.
     """
 
     def __init__(
@@ -59,6 +62,7 @@ class LeastSquares:
         size: int | None = None,
         weave: float = 0.0,
         axis: str = "x",
+        blur_px: float | None = None,
     ) -> None:
         self._response = response
         self._phases = tuple(phases)
@@ -67,6 +71,7 @@ class LeastSquares:
         self._size = size
         self._weave = weave
         self._axis = axis
+        self._known_blur = blur_px
         self._references = References(response)
         self._fits = [_Fit() for _ in range(1 + max(f for f, _ in phases))]
         self._noise = ResidualNoise(response)
@@ -97,10 +102,10 @@ class LeastSquares:
         if not ready or self._saturated is None:
             raise NotYet("a sinusoid needs 3 phases; they have not all come yet")
         noise = self._noise.noise()
-        blur = self._blur(ready)
+        blur, blur_from = self._blur(ready)
         solved = [
             self._separate(fit, noise, gain)
-            for fit, gain in zip(ready, self._gains(blur, len(ready)), strict=True)
+            for fit, gain in zip(ready, self._gains(blur), strict=False)
         ]
         direct, indirect, direct_var, global_var = _combine(solved)
         brightest = np.maximum.reduce([fit.brightest() for fit in ready])
@@ -127,6 +132,7 @@ class LeastSquares:
             "patterns": sum(fit.frames for fit in self._fits),
             "frequencies": len(ready),
             "blur_px": None if blur is None else round(blur, 3),
+            "blur_from": blur_from,
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
@@ -163,16 +169,17 @@ class LeastSquares:
             "unused": float(self._unused),
         }
 
-    def _blur(self, ready: list[_Fit]) -> float | None:
-        """The blur of projector and camera together, in projector pixels; None from one period.
+    def _blur(self, ready: list[_Fit]) -> tuple[float | None, str]:
+        """The blur of projector and camera together, in projector pixels, and how it is known: from
+        several periods, else as calibrated, else (None) it is not.
 
         Blur of standard deviation s takes exp(-2π²s²f²) from a wave of frequency f, so the ratio of
         two waves' amplitudes tells s. The median over the scene is taken: scattering within the
         scene, which is global light, differs from place to place and stays in the amplitudes.
         """
         if len(ready) < 2 or len(ready) != len(self._periods):
-            return None
-        squares = self._squared_frequencies()
+            return self._known_blur, "" if self._known_blur is None else "calibration"
+        squares = np.asarray([-log(of_wave(1.0, p, self._weave)) for p in self._periods])
         logs = []
         first = None
         for fit in ready:
@@ -183,19 +190,13 @@ class LeastSquares:
             ratio = power[bright] / np.maximum(first[bright], np.float32(1e-12))
             logs.append(0.5 * float(np.log(np.maximum(np.median(ratio), 1e-6))))
         slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
-        return float(np.sqrt(max(-slope, 0.0) / (2.0 * np.pi**2)))
+        return float(np.sqrt(max(-slope, 0.0))), "scan"
 
-    def _squared_frequencies(self) -> NDArray[np.float64]:
-        """Mean square of each wave's spatial frequency; its weave makes it higher along the other
-        axis."""
-        squares: NDArray[np.float64] = 1.0 / np.square(np.asarray(self._periods))
-        return squares * (1.0 + 0.5 * self._weave**2)
-
-    def _gains(self, blur: float | None, count: int) -> list[float]:
+    def _gains(self, blur: float | None) -> list[float]:
         """What gives each wave its amplitude back."""
-        if not blur:
-            return [1.0] * count
-        return [float(g) for g in np.exp(2.0 * np.pi**2 * blur**2 * self._squared_frequencies())]
+        if not self._periods:
+            return [1.0] * len(self._fits)
+        return [1.0 / of_wave(blur or 0.0, period, self._weave) for period in self._periods]
 
     def _separate(
         self, fit: _Fit, noise: Noise | None, gain: float

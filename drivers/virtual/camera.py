@@ -159,6 +159,8 @@ class VirtualCamera(VirtualDevice, Camera):
             self._format,
             black_level=self._black,
             exposure_range_us=EXPOSURE_US,
+            gain_range=GAIN_DB,
+            gain_unit="dB",
             max_rate_hz=NS / fastest,
             readout_s=self._o.readout_ms / 1e3,
             triggers=("software", "hardware") if self.bench.line else ("software",),

@@ -25,7 +25,7 @@ def coming(events: EventStream, count: int) -> list[tuple[PreviewTaken, dict[str
     """The next previews by hand."""
     seen: list[tuple[PreviewTaken, dict[str, object]]] = []
     while len(seen) < count:
-        notice = events.next(10.0)
+        notice = events.next(30.0)
         assert notice is not None
         assert isinstance(notice.body, PreviewTaken)
         if not notice.body.run:
@@ -91,10 +91,10 @@ def test_a_scan_takes_the_camera(daemon: Daemon) -> None:
 
 
 def test_a_camera_that_vanishes_ends_it(daemon: Daemon) -> None:
-    daemon.configure(camera='faults = ["vanish@3"]')
+    daemon.configure(camera='faults = ["vanish@10"]')
     with daemon.start() as rig, rig.subscribe("preview") as events:
         rig.live(rate_hz=15, lease_s=60)
-        coming(events, 2)
+        coming(events, 1)
         until(lambda: "live view ended" in daemon.log())
 
         def again() -> bool:
