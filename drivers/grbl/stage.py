@@ -116,7 +116,7 @@ class GrblStage(Stage):
         link.rx_bytes = it.rx_bytes
         link.scale = grbl.MM_PER_INCH if it.inches else 1.0
         usb = link.port.identity
-        identity = Identity(it.firmware, (usb.serial if usb else "") or it.label, it.version)
+        identity = Identity(str(it.firmware), (usb.serial if usb else "") or it.label, it.version)
         before = self._identity
         if before is not None and before.serial and identity.serial != before.serial:
             raise DeviceRefused(

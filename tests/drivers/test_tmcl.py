@@ -25,7 +25,8 @@ from drivers.base import (
     StageState,
     StageStatus,
 )
-from drivers.tmcl import TmclOptions, TmclStage, checksum, encode, find_answer
+from drivers.tmcl import TmclOptions, TmclStage
+from drivers.tmcl_protocol import checksum, encode, find_answer
 from tests.drivers.tmcl_peer import TmclPeer
 
 pytestmark = pytest.mark.timeout(20)
