@@ -88,6 +88,7 @@ class TmclStage(Stage):
             options.address,
             options.motor,
         )
+        self._line.on_lost = self._position_lost
         self._arc = Arc(options.centre_mm, options.radius_mm)
         self._track = Track()
         self._identity: Identity | None = None

@@ -12,6 +12,7 @@ the fence's answer is stale, and is passed over.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
 from drivers.base import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.clock import NS, Clock
@@ -37,6 +38,7 @@ class TmclLine:
 
     def __init__(self, port: SerialPort, clock: Clock, address: int, motor: int) -> None:
         self.port = port
+        self.on_lost: Callable[[], None] = lambda: None
         self.damaged = 0  # exchanges that failed, since it was made
         self._clock = clock
         self._address = address
@@ -116,14 +118,18 @@ class TmclLine:
 
     def _exchange(self, frame: bytes, command: Command) -> tuple[tuple[int, int] | None, bytes]:
         """Send, and what came within `REPLY_S`, until it holds the answer."""
-        self.port.write(frame)
-        deadline = self._clock.now_ns() + round(REPLY_S * NS)
         data = b""
-        while self._clock.now_ns() < deadline and not self._halted.is_set():
-            data = data[-MOST_BYTES:] + self.port.read()
-            answer = find_answer(data, self._address, command)
-            if answer is not None:
-                return answer, data
+        try:
+            self.port.write(frame)
+            deadline = self._clock.now_ns() + round(REPLY_S * NS)
+            while self._clock.now_ns() < deadline and not self._halted.is_set():
+                data = data[-MOST_BYTES:] + self.port.read()
+                answer = find_answer(data, self._address, command)
+                if answer is not None:
+                    return answer, data
+        except DeviceLost:
+            self.on_lost()
+            raise
         return None, data
 
     def _no_answer(self, command: Command, heard: bytes, phase: str) -> DeviceError:
