@@ -13,7 +13,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 
-import numpy as np
 import structlog
 
 from daemon.devicethread import Session
@@ -24,8 +23,9 @@ from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench
 from daemon.scans.single_image import SingleImageMethod
 from daemon.sequencer import CALL_S, SHOW_S
+from daemon.snapshot import snap
 from daemon.viewfinder import Viewfinder
-from drivers.base import Acquisition, Camera, CameraInfo, CameraSettings, DeviceError, Frame
+from drivers.base import Camera, CameraInfo, CameraSettings, DeviceError, Frame
 from protocol.errors import Code, UmbraError
 from protocol.messages import AnyEvent, LockInfo
 from protocol.patterns import AnyPattern, Stripes
@@ -234,22 +234,9 @@ class Manual:
         was_active = self.active
         session = self.use(_FRAME_S)
 
-        def take(cam: Camera) -> tuple[Frame, CameraInfo]:
-            info = cam.info()
-            out = np.zeros(info.shape, info.pixel_format.dtype)
-            cam.stop()  # a live view may have left it acquiring
-            cam.start(Acquisition.SOFTWARE)
-            try:
-                cam.trigger()
-                exposure_s = (cam.settings().exposure_us or 0.0) * 1e-6
-                return cam.grab(out, exposure_s + info.readout_s + _FRAME_S), info
-            finally:
-                cam.stop()
-
-        exposure_s = (camera.device.settings().exposure_us or 0.0) * 1e-6
         try:
             with self.live.aside():
-                frame, info = camera.call(take, exposure_s + 2 * CALL_S, session)
+                frame, info = snap(camera, session)
         except DeviceError as error:
             self._rig.failed(error)
             raise

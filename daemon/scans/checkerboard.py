@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from daemon import patterns
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import RankedMethod
+from daemon.scans.pattern_scan import FINE_PX, RankedMethod
 from daemon.separation.handedness import shift_weights
 from protocol.patterns import Checker
 from protocol.scans import Checkerboard
@@ -26,6 +26,11 @@ class CheckerboardMethod(RankedMethod[Checkerboard]):
         self._shifts = [(x, y) for y in offsets for x in offsets]
         shifted = [Checker(size=spec.checker, shift_x=x, shift_y=y) for x, y in self._shifts]
         super().__init__(spec, bench, shifted)
+
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return self.spec.checker <= FINE_PX
 
     def described(self) -> str:
         """See `PatternMethod`."""

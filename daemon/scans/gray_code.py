@@ -36,6 +36,11 @@ class GrayCodeMethod(PatternMethod[GrayCode]):
             ],
         )
 
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return False
+
     def described(self) -> str:
         """See `PatternMethod`."""
         count = len(self._images) // 2

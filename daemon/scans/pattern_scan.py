@@ -18,10 +18,14 @@ from daemon.separation.bracket import Bracketed
 from daemon.separation.estimator import Estimator, Lighting, Observation
 from daemon.separation.exposure_noise import ROUNDING, Sensor
 from daemon.separation.extremes import MaxMin
+from daemon.separation.frameset import FrameSet, Watched
 from daemon.separation.radiometry import Response
 from daemon.separation.topk import KEEP, TopK
 from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.scans import PatternScan, Radiometry, Reference
+
+FINE_PX = 64
+"""Patterns of larger checkers, patches or periods may light one end of a scene alone."""
 
 _PLACES, _MARGIN, _SAMPLES = 96, 8, 1500
 
@@ -232,15 +236,29 @@ class PatternMethod(Method[P]):
     def estimator(self) -> Estimator:
         """See `Method`. Exposures of a bracket are merged before the method's own estimator."""
         if self.spec.bracket is None:
-            return self.separator(self.response, self.spec.average)
+            return self._watched(self.response, self.spec.average)
         return Bracketed(
             self.response,
-            lambda response: self.separator(response, 1),
+            lambda response: self._watched(response, 1),
             factors=self.spec.bracket,
             average=self.spec.average,
             own_us=self._own_us,
             sensor=self._sensor(),
         )
+
+    def _watched(self, response: Response, average: int) -> Estimator:
+        frames = FrameSet(response, even=self.even, distinct=self.distinct)
+        return Watched(self.separator(response, average), frames)
+
+    @property
+    def even(self) -> bool:
+        """Whether each pattern gives the scene as a whole the same light."""
+        return True
+
+    @property
+    def distinct(self) -> bool:
+        """Whether no two patterns are alike."""
+        return True
 
     def _sensor(self) -> Sensor | None:
         """The camera's noise as calibrated; None where it is not, or counts are not linear."""
@@ -286,6 +304,7 @@ class RankedMethod(PatternMethod[P]):
                 leakage=self.leakage,
                 average=average,
                 levels=self.levels,
+                weights=self.weights(),
             )
         return TopK(
             response,

@@ -35,6 +35,16 @@ class SingleImageMethod(PatternMethod[SingleImage]):
         stripes = Stripes(width=spec.stripe, axis=spec.axis)
         super().__init__(spec, bench, [stripes] * spec.repeat)
 
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return False  # a stream may show anything
+
+    @property
+    def distinct(self) -> bool:
+        """See `PatternMethod`."""
+        return False
+
     def described(self) -> str:
         """See `PatternMethod`."""
         return "one image" if self.spec.repeat == 1 else f"{self.spec.repeat} images"

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import PatternMethod
+from daemon.scans.pattern_scan import FINE_PX, PatternMethod
 from daemon.separation.estimator import Estimator
 from daemon.separation.radiometry import Response
 from daemon.separation.sinusoid import LeastSquares
@@ -31,6 +31,11 @@ class SinusoidMethod(PatternMethod[Sinusoid]):
         if len(set(spec.periods)) < len(spec.periods):
             raise Unsuitable("each period is to be named once", "$.periods")
         super().__init__(spec, bench, shown)
+
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return max(self.spec.periods) <= FINE_PX
 
     def described(self) -> str:
         """See `PatternMethod`."""
@@ -77,6 +82,11 @@ class RandomPhaseMethod(PatternMethod[RandomPhase]):
             for phase in _phases(spec.phases)
         ]
         super().__init__(spec, bench, shown)
+
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return self.spec.patch <= FINE_PX
 
     def described(self) -> str:
         """See `PatternMethod`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import PatternMethod
+from daemon.scans.pattern_scan import FINE_PX, PatternMethod
 from daemon.separation.estimator import Estimator
 from daemon.separation.light_model import complement_determinants
 from daemon.separation.pair import ComplementPair
@@ -38,6 +38,11 @@ class TwoImageMethod(PatternMethod[TwoImage]):
     def lit_fraction(self) -> float:
         """α of the first image: as asked for, else the checkerboard's own on this projector."""
         return self.lit_fraction_of(self._patterns[:1])
+
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return self.spec.checker <= FINE_PX and abs(self.lit_fraction - 0.5) < 0.05
 
     def described(self) -> str:
         """See `PatternMethod`."""

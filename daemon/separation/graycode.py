@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import SIGNIFICANT, Judgement, finish
+from daemon.separation.coordinates import mirrored_coordinates
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
+from daemon.separation.frameset import PairSums
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
@@ -27,6 +29,13 @@ FINE = 4
 
 _KEPT = 0.95
 """A stripe resolves a pixel that has at least this part of the best contrast."""
+
+
+_SEEN = 2
+"""The bit by whose stripes, 8 px wide, a mirror's finer ones are told."""
+
+_DIRECT = 0.25
+"""Of the light: with less that is direct, a pixel's coordinate says nothing of mirrors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +74,7 @@ class GrayCodeDecoder:
         self._whole: Plane | None = None  # sum of P + I over all pairs
         self._brightest: Plane | None = None
         self._pairs = 0
+        self._sums = PairSums()
         self._saturated: NDArray[np.bool_] | None = None
         self._unused = 0
 
@@ -113,6 +123,7 @@ class GrayCodeDecoder:
         self._codes[image.axis].add(image.bit, _grey(difference))
         if image.bit < FINE:
             self._difference[key] = difference
+        self._sums.add(whole)
         brighter = np.maximum(shown, inverse)
         if self._whole is None or self._brightest is None:
             self._whole, self._brightest = whole, brighter
@@ -148,7 +159,17 @@ class GrayCodeDecoder:
             "global_std": global_std,
             "stripe": stripe,
         }
-        planes.update(self.coordinates(np.float32(SIGNIFICANT) * _grey(deviation)))
+        coordinates = self.coordinates(np.float32(SIGNIFICANT) * _grey(deviation))
+        planes.update(coordinates)
+        told = mirrored_coordinates(
+            coordinates,
+            self._strength(contrast, pair, deviation),
+            self._stripes(),
+        )
+        sums, unequal = self._sums.told(float(np.median(deviation)))
+        flags = bits(told.mirrored, Quality.RESIDUE)
+        if moved is not None:
+            flags |= moved
         return finish(
             direct,
             indirect,
@@ -160,7 +181,7 @@ class GrayCodeDecoder:
                 total=np.float32(SIGNIFICANT) * global_std,
                 deviation=deviation,
             ),
-            flags=moved,
+            flags=flags,
             planes=planes,
             facts={
                 "estimator": "finest stripes",
@@ -175,7 +196,9 @@ class GrayCodeDecoder:
                 },
                 **self._references.facts(total.source),
                 **steady,
-                "advice": advice,
+                **told.facts,
+                **sums,
+                "advice": unequal + told.advice + advice,
             },
         )
 
@@ -186,6 +209,19 @@ class GrayCodeDecoder:
             "column" if axis == "x" else "row": code.decode(limit)
             for axis, code in self._codes.items()
         }
+
+    def _strength(self, contrast: Plane, pair: Plane, deviation: Plane) -> Plane:
+        """Contrast of the stripes by its noise; 0 where little light is direct, for there the
+        coarse bits were told by global light."""
+        strong = _grey(contrast) / np.maximum(_grey(deviation), np.float32(1e-6))
+        return np.where(_grey(contrast) > np.float32(_DIRECT) * _grey(pair), strong, np.float32(0))
+
+    def _stripes(self) -> Plane | None:
+        """P - I of the stripes of each axis that are fine and yet resolved, multiplied."""
+        found = [_grey(d) for key, d in self._difference.items() if key[1] == _SEEN]
+        if len(found) < len(self._codes):
+            return None
+        return found[0] if len(found) == 1 else np.sign(found[0]) * found[1]
 
     def _finest(self, deviation: Plane) -> tuple[Plane, NDArray[np.uint16]]:
         """|P - I| of the finest stripes that keep their contrast, and their width (H, W)."""

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import light_model
-from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import Judgement, finish
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
 from daemon.separation.steadiness import compare
+from daemon.separation.straddling import Straddling
 
 
 class ComplementPair:
@@ -67,13 +68,21 @@ class ComplementPair:
             self._references, (first + second) * np.float32(0.5), deviation, self._leakage
         )
         direct, indirect = light_model.from_complement_pair(lit, unlit, self._alpha, self._leakage)
+        pattern = Straddling.of_pair(
+            lit, unlit, self._alpha, self._leakage, deviation, self._response.bayer
+        )
+        flags = bits(pattern.straddling, Quality.LOW_MODULATION)
+        if pattern.mirrored is not None:
+            flags |= bits(pattern.mirrored, Quality.RESIDUE)
+        if moved is not None:
+            flags |= moved
         return finish(
             direct,
             indirect,
             response=self._response,
             brightest=brightest,
             saturated=self._saturated,
-            flags=moved,
+            flags=flags,
             planes=self._deviations(deviation, self._noise.deviation(np.minimum(first, second))),
             judgement=Judgement.of_extremes(deviation, 2),
             facts={
@@ -85,6 +94,7 @@ class ComplementPair:
                 "noise_from": self._noise.source,
                 **self._references.facts(source),
                 **steady,
+                **pattern.facts,
                 **self._residual(first, second),
                 "advice": advice,
             },

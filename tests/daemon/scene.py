@@ -82,8 +82,8 @@ class Scene:
         return Bench(
             CameraInfo(self.width, self.height, self.pixel_format),
             ProjectorInfo(self.width, self.height, refresh_hz=60),
-            exposure_us=OWN_US,
             calibration=self.calibration,
+            exposure_us=OWN_US,
         )
 
     def scan(self, spec: AnyScan, seed: int = 1) -> Components:
