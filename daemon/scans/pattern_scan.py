@@ -126,7 +126,9 @@ class PatternMethod(Method[P]):
             )
         if self.bench.camera.recorded:
             return tuple(replace(step, exposure=f) for step in plain for f in factors)
-        own_us = exposure_of(self.spec.exposure_us, self.bench)
+        # with auto-exposure the spec's own is the longest that may be chosen
+        asked_us = None if self.spec.auto_exposure else self.spec.exposure_us
+        own_us = exposure_of(asked_us, self.bench)
         self._own_us = self.bench.exposure_us or own_us
         shortest, longest = self.bench.camera.exposure_range_us
         beyond = [f for f in factors if not shortest <= f * own_us <= longest]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -38,9 +39,10 @@ def separated(rig: umbra.Client, scan: Any) -> tuple[Any, dict[str, Any]]:
 
 def test_a_bracket_brings_the_highlights_back(daemon: Daemon) -> None:
     with daemon.start() as rig:
+        before_us = rig.camera().exposure_us
         _, plain = separated(rig, umbra.Checkerboard(exposure_us=LONG_US))
         info, facts = separated(rig, umbra.Checkerboard(exposure_us=LONG_US, bracket=BRACKET))
-        assert rig.camera().exposure_us == LONG_US
+        assert rig.camera().exposure_us == before_us
     assert info.recorded == info.planned == 3 * (2 + 25)
     assert plain["quality"]["saturated"]["fraction"] > 0.4
     assert facts["quality"]["saturated"]["fraction"] == 0
@@ -89,12 +91,31 @@ def test_a_killed_run_resumes_within_a_bracket_to_the_same_bits(daemon: Daemon) 
 
 def test_after_an_abort_the_camera_has_its_own_exposure_again(daemon: Daemon) -> None:
     with daemon.start() as rig:
+        before_us = rig.camera().exposure_us
         run = rig.scan(umbra.TwoImage(exposure_us=LONG_US, bracket=(4.0, 2.0), average=1000)).id
         recorded(rig, run, 5)
         rig.abort()
         until(lambda: rig.run(run).refresh().state is RunState.ABORTED)
         until(lambda: rig.status().run is None)
-        assert rig.camera().exposure_us == LONG_US
+        assert rig.camera().exposure_us == before_us
+
+
+def test_auto_exposure_chooses_what_the_bracket_is_of(daemon: Daemon) -> None:
+    with daemon.start() as rig:
+        scan = umbra.TwoImage(auto_exposure=True, exposure_us=1e5, bracket=(1.0, 4.0))
+        info, facts = separated(rig, scan)
+        own_us = settings_of(daemon, info.id)["exposure_us"]
+        frames = FrameStore.open(daemon.data / "runs" / info.id, readonly=True).records()
+    assert own_us < 1e5
+    assert {round(r.exposure_us / own_us, 6) for r in frames} == {1.0, 4.0}
+    assert facts["bracket"]["ratios_measured"]["4/1"] == pytest.approx(4.0, rel=0.01)
+
+
+def settings_of(daemon: Daemon, run: str) -> dict[str, Any]:
+    """The camera's settings as run.json has them."""
+    file = json.loads((daemon.data / "runs" / run / "run.json").read_text())
+    settings: dict[str, Any] = file["rig"]["settings"]
+    return settings
 
 
 def test_exposures_beyond_the_cameras_are_refused_at_once(daemon: Daemon) -> None:
