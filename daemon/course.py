@@ -38,7 +38,7 @@ from drivers.base import CameraInfo, DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
 from protocol.messages import End, Progress, RunState, Waiting
-from protocol.scans import OccluderScan
+from protocol.scans import OccluderScan, PatternScan
 
 _PROGRESS_S = 0.1
 _ROOM_S = 1.0
@@ -197,6 +197,8 @@ class Course:
         method = self._method = prepared.method
         info, exposure = prepared.camera, prepared.exposure
         self._exposure_s = prepared.settings.get("exposure_us", 0.0) * 1e-6
+        if isinstance(file.spec, PatternScan) and file.spec.bracket is not None:
+            self._exposure_s *= max(file.spec.bracket)  # how long it may show no sign of life
         self._waits = None
         rig = {**self._rig.snapshot(), "settings": prepared.settings}
         if exposure is not None:
