@@ -84,6 +84,9 @@ class _AravisNodes(Nodes):
             return ()
         return tuple(self._device.dup_available_enumeration_feature_values_as_strings(name))
 
+    def code(self, name: str) -> int:
+        return int(self._device.get_integer_feature_value(name)) & 0xFFFFFFFF
+
     def execute(self, name: str) -> None:
         self._device.execute_command(name)
 
@@ -204,6 +207,7 @@ class AravisCamera(SfncCamera):
             release=lambda: stream.push_buffer(buffer),
             stride=self._stride(buffer) if whole else None,
             incomplete=not whole,
+            pixel_code=int(buffer.get_image_pixel_format()) & 0xFFFFFFFF if whole else None,
         )
 
     def _stride(self, buffer: Any) -> int | None:
