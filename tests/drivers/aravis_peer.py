@@ -1,15 +1,17 @@
 """Aravis's fake GigE Vision camera with a sensor of our own: packed and plain 12 bit mosaics.
 
-    python aravis_peer.py ADDRESS SERIAL
+    python aravis_peer.py ADDRESS SERIAL [FILM]
 
 Aravis's own program knows 8 and 16 bit only. This one runs the same camera, protocol and all, gives
 it three more pixel formats, and fills its buffers. Its mosaic begins with R and G wherever the
 region begins, as the fake's own does: the name of the format says what a frame begins with.
+FILM is an .npy of pictures (N, H, W) that it sees instead, one a frame.
 """
 
 from __future__ import annotations
 
 import ctypes
+import itertools
 import sys
 import tempfile
 from pathlib import Path
@@ -41,8 +43,9 @@ def stored(samples: NDArray[np.uint16], code: int) -> NDArray[np.uint8]:
     return np.stack(parts, axis=1).astype(np.uint8).ravel()
 
 
-def serve(address: str, serial: str, folder: Path) -> None:
+def serve(address: str, serial: str, folder: Path, film: str = "") -> None:
     """Be the camera until the process ends."""
+    pictures = itertools.cycle(np.load(film)) if film else None
     import gi
 
     gi.require_version("Aravis", "0.8")
@@ -66,8 +69,14 @@ def serve(address: str, serial: str, folder: Path) -> None:
     callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, *3 * (ctypes.c_uint32,))
 
     def fill(buffer: int, _: Any, exposure_us: int, gain: int, code: int) -> None:
-        region = (fake.read_register(at)[1] for at in (OFFSET_X, OFFSET_Y, WIDTH, HEIGHT))
-        data = stored(sensor(*region), code)
+        x, y, width, height = (
+            fake.read_register(at)[1] for at in (OFFSET_X, OFFSET_Y, WIDTH, HEIGHT)
+        )
+        if pictures is None:
+            samples = sensor(x, y, width, height)
+        else:
+            samples = next(pictures)[y : y + height, x : x + width]
+        data = stored(samples, code)
         ctypes.memmove(data_of(buffer, None), data.ctypes.data, len(data))
 
     kept = callback(fill)
@@ -89,4 +98,4 @@ def _description(aravis: Any) -> str:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as made:
-        serve(sys.argv[1], sys.argv[2], Path(made))
+        serve(sys.argv[1], sys.argv[2], Path(made), "".join(sys.argv[3:4]))

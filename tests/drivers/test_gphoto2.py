@@ -177,8 +177,9 @@ def test_raw_gives_the_sensors_own_counts() -> None:
     cam.close()
 
 
-@pytest.mark.parametrize("order", ["RG", "GR", "GB", "BG"])
-@pytest.mark.parametrize("margins", [(0, 0), (1, 3), (2, 1)])
+@pytest.mark.parametrize(
+    ("order", "margins"), [("RG", (0, 0)), ("GR", (1, 3)), ("GB", (2, 1)), ("BG", (1, 2))]
+)
 def test_raw_of_12_bits_keeps_its_order_whatever_lies_before_the_picture(
     order: str, margins: tuple[int, int]
 ) -> None:

@@ -41,11 +41,14 @@ def compiler() -> str:
     return shutil.which("gcc") or shutil.which("cc") or ""
 
 
-def build(folder: Path) -> Path:
-    """Compile the producer into `folder`."""
-    xml, made = folder / "toy.xml", folder / "toy.cti"
+def build(folder: Path, film: NDArray[np.uint16] | None = None) -> Path:
+    """Compile the producer into `folder`; `film` (N, 96, 128) 12 bit is what its camera sees."""
+    xml, pictures, made = folder / "toy.xml", folder / "film", folder / "toy.cti"
     xml.write_text(description())
-    options = ["-std=gnu11", "-O1", "-shared", "-fPIC", "-pthread", f'-DXML="{xml}"']
+    if film is not None:
+        pictures.write_bytes(film.astype("<u2").tobytes())
+    options = ["-std=gnu11", "-O1", "-shared", "-fPIC", "-pthread"]
+    options += [f'-DXML="{xml}"', f'-DFILM="{pictures}"']
     subprocess.run([compiler(), *options, "-o", made, HERE / "producer.c"], check=True)
     return made
 
@@ -65,12 +68,12 @@ def description() -> str:
         "<Sign>Signed</Sign><Endianess>LittleEndian</Endianess></IntReg>"
         for k, name in enumerate(NUMBERS.split())
     )
-    plain = _integer("Width", 1, 64) + _integer("Height", 1, 48) + _integer("OffsetX", 0, 63)
-    plain += _integer("OffsetY", 0, 47) + _integer("PayloadSize", 0, 1 << 20)
+    plain = _integer("Width", 1, 128) + _integer("Height", 1, 96) + _integer("OffsetX", 0, 127)
+    plain += _integer("OffsetY", 0, 95) + _integer("PayloadSize", 0, 1 << 20)
     plain += _integer("TimestampLatchValue", 0, 1 << 62)
     plain += "".join(_integer(name, 0, 1 << 30) for name in ("Skip", "Break", "Vanish", "PaddingX"))
-    plain += _integer("WidthMax", 64, 64, "<Value>64</Value>")
-    plain += _integer("HeightMax", 48, 48, "<Value>48</Value>")
+    plain += _integer("WidthMax", 128, 128, "<Value>128</Value>")
+    plain += _integer("HeightMax", 96, 96, "<Value>96</Value>")
     exposure = (
         '<Converter Name="ExposureTimeConverter"><FormulaTo>FROM</FormulaTo>'
         "<FormulaFrom>TO</FormulaFrom><pValue>ExposureTimeRegister</pValue></Converter>"

@@ -1,11 +1,12 @@
 /* A GenTL producer with one camera, which knows its own sensor: for the gentl driver's tests.
  *
- * The sensor is 64 x 48, 12 bit, a mosaic whose first two pixels are R and G; the pixel at (x, y) of
- * the sensor holds (37 x + 101 y + 5) mod 4096. As many real cameras do, it names the mosaic by the
+ * The sensor is 128 x 96, 12 bit, a mosaic whose first two pixels are R and G; the pixel at (x, y) of
+ * the sensor holds (37 x + 101 y + 5) mod 4096, or else it sees a film, one picture a frame. As many real cameras do, it names the mosaic by the
  * region's first pixel: an odd offset turns BayerRG12p into BayerGR12p. Its frames can be triggered,
  * its clock latched, and it can be told to skip frames, to break them, and to vanish.
  *
- * Compiled by the tests; -DXML="path" names the description that the camera carries.
+ * Compiled by the tests; -DXML="path" names the description that the camera carries, -DFILM="path"
+ * the film, if there is one: pictures of the whole sensor, 16 bit, one after the other.
  */
 #include <pthread.h>
 #include <stdbool.h>
@@ -21,7 +22,7 @@ enum {
     NOT_AVAILABLE = -1014, BAD_ADDRESS = -1015, TOO_SMALL = -1016,
 };
 enum { STRING = 1, INT32 = 5, UINT32 = 6, UINT64 = 8, PTR = 10, BOOL8 = 11, SIZET = 12 };
-enum { SENSOR_W = 64, SENSOR_H = 48, XML_AT = 0x10000000 };
+enum { SENSOR_W = 128, SENSOR_H = 96, XML_AT = 0x10000000 };
 enum { /* registers, 8 bytes each, by number */
     WIDTH, HEIGHT, OFFSET_X, OFFSET_Y, PIXEL_FORMAT, PAYLOAD, ACQUIRE, TRIGGER_MODE, TRIGGER_SOURCE,
     TRIGGER, EXPOSURE_US, LATCH, LATCHED_NS, SKIP, BREAK, VANISH, PADDING_X, RATE_MHZ, REGISTERS
@@ -53,6 +54,8 @@ static char tl, interface, local, remote, stream, event; /* handles are their ad
 static bool is_open;
 static char *xml;
 static size_t xml_size;
+static char *film;
+static size_t film_size;
 static int64_t reg[REGISTERS];
 static int packing;
 static buffer *announced, *queue, *current;
@@ -104,13 +107,20 @@ static size_t payload(void)
     return ((bits + 7) / 8 + reg[PADDING_X]) * reg[HEIGHT];
 }
 
+static unsigned seen(int64_t x, int64_t y)
+{
+    size_t picture = 2 * SENSOR_W * SENSOR_H, pictures = film_size / picture;
+    if (!pictures) return (37 * x + 101 * y + 5) % 4096;
+    return ((uint16_t *)(film + frame_id % pictures * picture))[y * SENSOR_W + x];
+}
+
 static void expose(buffer *b)
 {
-    size_t bit = 0, k = 0;
+    size_t bit = 0;
     memset(b->data, 0, b->size);
     for (int64_t y = 0; y < reg[HEIGHT]; y++) {
-        for (int64_t x = 0; x < reg[WIDTH]; x++, k++) {
-            unsigned v = (37 * (x + reg[OFFSET_X]) + 101 * (y + reg[OFFSET_Y]) + 5) % 4096;
+        for (int64_t x = 0; x < reg[WIDTH]; x++) {
+            unsigned v = seen(x + reg[OFFSET_X], y + reg[OFFSET_Y]);
             size_t at = bit / 8;
             if (packing == PLAIN) {
                 b->data[at] = v, b->data[at + 1] = v >> 8;
@@ -132,7 +142,7 @@ static void expose(buffer *b)
     if (reg[BREAK] > 0) reg[BREAK]--, b->whole = false, b->filled /= 2;
     while (reg[SKIP] > 0) reg[SKIP]--, frame_id++;
     b->id = frame_id++;
-    b->stamp_ns = now_ns() - 1000u * reg[EXPOSURE_US];
+    b->stamp_ns = due_ns - 1000u * reg[EXPOSURE_US];
     memcpy(b->made, reg, sizeof reg);
     b->made[PIXEL_FORMAT] = CODES[packing][phase()];
 }
@@ -165,26 +175,34 @@ static error write_register(int k, int64_t value)
 
 /* ---------------------------------------------------------------- library and ports */
 
+static char *contents(const char *path, size_t *size)
+{
+    FILE *f = fopen(path, "rb");
+    *size = 0;
+    if (!f) return NULL;
+    fseek(f, 0, SEEK_END);
+    size_t length = ftell(f);
+    rewind(f);
+    char *data = malloc(length + 1);
+    *size = fread(data, 1, length, f);
+    fclose(f);
+    return data;
+}
+
 error GCInitLib(void)
 {
-    FILE *f = fopen(XML, "rb");
-    if (!f) return IO_ERROR;
-    fseek(f, 0, SEEK_END);
-    xml_size = ftell(f);
-    rewind(f);
-    xml = malloc(xml_size);
-    size_t got = fread(xml, 1, xml_size, f);
-    fclose(f);
+    xml = contents(XML, &xml_size);
+    film = contents(FILM, &film_size);
     memset(reg, 0, sizeof reg);
     reg[WIDTH] = SENSOR_W, reg[HEIGHT] = SENSOR_H, reg[EXPOSURE_US] = 2000, reg[RATE_MHZ] = 100000;
     packing = PLAIN;
-    return got == xml_size ? OK : IO_ERROR;
+    return xml ? OK : IO_ERROR;
 }
 
 error GCCloseLib(void)
 {
-    free(xml);
-    xml = NULL;
+    free(xml), free(film);
+    xml = film = NULL;
     is_open = false;
     return OK;
 }
@@ -458,8 +476,8 @@ error EventGetData(void *h, void *to, size_t *room, uint64_t timeout_ms)
             queue = b->next;
             b->queued = false;
             pending = 0;
-            due_ns += period_ns();
             expose(b);
+            due_ns += period_ns();
             memcpy(to, told, sizeof told);
             *room = sizeof told;
             break;
