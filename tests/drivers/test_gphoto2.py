@@ -40,6 +40,8 @@ try:
 except UnknownDriver as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
+import gphoto2 as gp  # noqa: E402
+
 from drivers.gphoto2 import GphotoCamera, GphotoOptions  # noqa: E402
 from drivers.gphoto2config import number  # noqa: E402
 from drivers.rawfile import develop  # noqa: E402
@@ -245,6 +247,51 @@ def test_pictures_that_change_or_break(cam: GphotoCamera, monkeypatch: pytest.Mo
         grab(cam)
     with pytest.raises(BadImage, match="neither JPEG nor RAW"):
         develop(b"text" * 100)
+
+
+@pytest.mark.parametrize(
+    ("code", "kind", "says"),
+    [
+        (gp.GP_ERROR_IO, DeviceLost, "connect again"),
+        (gp.GP_ERROR_IO_READ, DeviceLost, "connect again"),
+        (gp.GP_ERROR_IO_USB_FIND, DeviceLost, "connect again"),
+        (gp.GP_ERROR_IO_USB_CLAIM, DeviceRefused, "another program holds it"),
+        (gp.GP_ERROR_CAMERA_BUSY, DeviceTimeout, "wait until its card is written"),
+        (gp.GP_ERROR_TIMEOUT, DeviceTimeout, "connect again"),
+        (gp.GP_ERROR_NO_SPACE, DeviceRefused, "empty its card"),
+    ],
+)
+def test_what_the_library_says_has_a_name_and_a_remedy(
+    cam: GphotoCamera, code: int, kind: type[Exception], says: str
+) -> None:
+    """Unplugged, held by a desktop, busy, full: at each call that talks to the camera."""
+
+    class Failing:
+        def __getattr__(self, name: str) -> Any:
+            def call(*arguments: Any) -> Any:
+                raise gp.GPhoto2Error(code)
+
+            return call
+
+    cam.start(Acquisition.SOFTWARE)
+    whole, cam._camera = cam._camera, Failing()
+    calls = {
+        "check": cam.check,
+        "trigger": cam.trigger,
+        "grab": lambda: grab(cam),
+        "start": lambda: cam.start(Acquisition.SOFTWARE),
+    }
+    for phase, call in calls.items():
+        with pytest.raises(kind, match=f"cam: {phase}: .*{says}"):
+            call()
+        cam._acquisition = Acquisition.SOFTWARE
+    cam.safe()
+    cam.close()  # one that is gone is let go of all the same
+    whole.exit()
+    cam.connect()
+    cam.start(Acquisition.SOFTWARE)
+    cam.trigger()
+    assert not grab(cam).incomplete
 
 
 def test_halt_ends_a_blocked_grab(cam: GphotoCamera) -> None:
