@@ -8,7 +8,7 @@ import shutil
 import struct
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -265,17 +265,18 @@ def test_what_the_library_says_has_a_name_and_a_remedy(
     cam: GphotoCamera, code: int, kind: type[Exception], says: str
 ) -> None:
     """Unplugged, held by a desktop, busy, full: at each call that talks to the camera."""
+    error: BaseException = gp.GPhoto2Error(code)
 
     class Failing:
         def __getattr__(self, name: str) -> Any:
             def call(*arguments: Any) -> Any:
-                raise gp.GPhoto2Error(code)
+                raise error
 
             return call
 
     cam.start(Acquisition.SOFTWARE)
     whole, cam._camera = cam._camera, Failing()
-    calls = {
+    calls: dict[str, Callable[[], object]] = {
         "check": cam.check,
         "trigger": cam.trigger,
         "grab": lambda: grab(cam),
