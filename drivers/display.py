@@ -46,7 +46,7 @@ class DisplayProjector(Projector):
     """See the module. `show` also takes (H, W, 3) RGB, for drivers that send bit planes.
 
     The moment that `show` gives is the flip's plus `latency_frames` refreshes: measure those
-    (docs/projectors.md). The safe state is black, the lamp stays on; `safe` returns when it is
+    (docs/hardware.md). The safe state is black, the lamp stays on; `safe` returns when it is
     black by the same reckoning.
     """
 
