@@ -373,8 +373,8 @@ class GrblPeer:
             }  # fmt: skip
             if s.dialect == "FluidNC":
                 values = {13: int(s.inches), 30: 1000, 32: 0}
-            for key, value in values.items():
-                self._say(f"${key}={value:.3f}" if key > 99 else f"${key}={value}")
+            for key, number in values.items():
+                self._say(f"${key}={number:.3f}" if key > 99 else f"${key}={number}")
             self._ok()
         elif line == "$X":
             if self.state == "Alarm":
