@@ -124,7 +124,7 @@ class Preparation:
             exposure = self._meter(session, wanted).choose()
             log.info("exposure chosen", **exposure.facts())
             wanted = replace(wanted, exposure_us=exposure.exposure_us)
-        self._settings = self._configure(session, wanted)
+            self._settings = self._configure(session, wanted)
         calibration = file.calibration if resuming else None
         if calibration is None:
             calibration = self._calibration()
