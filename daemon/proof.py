@@ -11,6 +11,8 @@ map from camera to projector:
 - a frame that is as good as equal to the one before, while other pairs of the same family of
   patterns differ, shows the pattern before.
 
+Only frames of one exposure time are compared, and of these what was not saturated.
+
 Pure: no I/O, no threads. Only a sample of each frame is kept, so that it costs little.
 """
 
@@ -27,6 +29,7 @@ from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting
 
 _SAMPLES = 20_000
+_FEW = 500  # samples that were not saturated: fewer say nothing
 _BRIGHTER = 5.0  # standard errors: by how much white must be brighter than black, at least
 _OFF_LEVEL = 0.4  # of the way from black to white: how far a pattern's brightness may be off
 _SAME = 0.35  # of the usual difference between two patterns: below it they are one
@@ -50,42 +53,65 @@ def expected_level(image: NDArray[np.uint8]) -> float | None:
 
 
 class Proof:
-    """Judges frame after frame of one scan; a frame that failed is forgotten, not compared with."""
+    """Judges frame after frame of one scan; a frame that failed is forgotten, not compared with.
 
-    def __init__(self) -> None:
-        self._black: Sample | None = None
-        self._white: float | None = None
-        self._last: tuple[Expose, Sample] | None = None
-        self._family: object = None
-        self._differences: deque[float] = deque(maxlen=16)
+    `full_scale` is the count of a saturated sample.
+    """
+
+    def __init__(self, full_scale: float = np.inf) -> None:
+        self._full_scale = full_scale
+        self._exposures: dict[float | None, _Looks] = {}
 
     def problem(self, pixels: NDArray[Any], step: Expose, expected: float | None) -> str:
         """Why the frame (H, W) or (H, W, 3) cannot be of this step; "" if it can.
 
         `expected` is the `expected_level` of what the projector was given.
         """
+        looks = self._exposures.setdefault(step.exposure_us, _Looks(self._full_scale))
+        return looks.problem(pixels, step, expected)
+
+
+class _Looks:
+    """The frames of one exposure time."""
+
+    def __init__(self, full_scale: float) -> None:
+        self._full_scale = full_scale
+        self._black: Sample | None = None
+        self._white: Sample | None = None
+        self._last: tuple[Expose, Sample] | None = None
+        self._family: object = None
+        self._differences: deque[float] = deque(maxlen=16)
+
+    def problem(self, pixels: NDArray[Any], step: Expose, expected: float | None) -> str:
+        """See `Proof`."""
         sample = _sample(pixels)
-        level = float(sample.mean())
-        found = self._problem(sample, level, step, expected)
+        found = self._problem(sample, step, expected)
         if not found:
-            self._remember(sample, level, step)
+            self._remember(sample, step)
         return found
 
-    def _problem(self, sample: Sample, level: float, step: Expose, expected: float | None) -> str:
+    def _problem(self, sample: Sample, step: Expose, expected: float | None) -> str:
         if step.lighting is Lighting.WHITE:
-            if self._black is not None and not _brighter(sample, self._black):
+            if self._black is None:
+                return ""
+            good = self._black < self._full_scale
+            enough = good.sum() >= min(_FEW, good.size)
+            if enough and not _brighter(sample[good], self._black[good]):
                 return "the white frame is not brighter than the black one: the projector is late"
             return ""
         if step.lighting is not Lighting.PATTERN:
             return ""
-        return self._of_level(level, expected) or self._of_repetition(sample, step)
+        return self._of_level(sample, expected) or self._of_repetition(sample, step)
 
-    def _of_level(self, level: float, expected: float | None) -> str:
+    def _of_level(self, sample: Sample, expected: float | None) -> str:
         """Compare with the levels of black and white, where the scan has taken both."""
         if self._black is None or self._white is None or expected is None:
             return ""
-        black = float(self._black.mean())
-        share = (level - black) / (self._white - black)
+        good = self._white < self._full_scale
+        if good.sum() < min(_FEW, good.size):
+            return ""
+        black, white = float(self._black[good].mean()), float(self._white[good].mean())
+        share = (float(sample[good].mean()) - black) / (white - black)
         if abs(share - expected) <= _OFF_LEVEL:
             return ""
         return (
@@ -106,11 +132,11 @@ class Proof:
                 return "the frame shows the pattern before its own: the projector is late"
         return ""
 
-    def _remember(self, sample: Sample, level: float, step: Expose) -> None:
+    def _remember(self, sample: Sample, step: Expose) -> None:
         if step.lighting is Lighting.BLACK:
             self._black = sample
         elif step.lighting is Lighting.WHITE:
-            self._white = level
+            self._white = sample
         if step.lighting is not Lighting.PATTERN:
             return
         if (family := _family(step)) != self._family:

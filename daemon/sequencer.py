@@ -2,7 +2,7 @@
 
 For a pattern step the light is first this pattern's (`show` returns at that moment), then the
 camera is triggered; the next pattern is drawn while the exposure lasts and flipped as soon as it
-ends, so that readout and flip go on side by side:
+ends, so that readout and flip go on side by side (for the exposures of a bracket the light stays):
 
     projector   |flip k|..........|flip k+1|..........
     camera             |expose k| readout k |expose k+1|
@@ -127,7 +127,7 @@ class Sequencer:
         self._lit: Expose | None = None
         self._lit_ns = 0
         self._lit_level: float | None = None
-        self._looks = Proof() if method.looked_at else None
+        self._looks = Proof(self._info.pixel_format.full_scale) if method.looked_at else None
         self.reason = "all steps were exposed"
 
     def run(self, step_index: int, sub: int, taken: int) -> None:
@@ -170,6 +170,7 @@ class Sequencer:
         """Dark and held for as long as the pause lasts."""
         self._camera.call(lambda c: c.stop(), CALL_S, self._session)
         self._acquisition = None
+        self._lit = None
         if self._projector is not None:
             self._projector.call(lambda p: p.safe(), SAFE_S, self._session)
         for light in self._rig.lights.values():
@@ -185,7 +186,10 @@ class Sequencer:
             return
         self._set_exposure(step.exposure_us)
         self._acquire(Acquisition.SOFTWARE)
-        self._light(step)
+        if self._lit is not None and _next_of_bracket(self._lit, step):
+            self._lit = step  # the light is this step's already
+        else:
+            self._light(step)
         for sub in range(first, step.frames):
             self._settle()
             self._pause_within(step)
@@ -513,3 +517,9 @@ class Sequencer:
         self._taken += 1
         log.error("frame missing", step=index, sub=sub, reason=reason)
         self._recorder.put(Exposed(step=step, index=index, sub=sub, frame=None, missing=reason))
+
+
+def _next_of_bracket(lit: Expose, step: Expose) -> bool:
+    """Whether a step shows what the one before it shows, for another exposure of one bracket."""
+    same = (lit.pattern, lit.lighting, lit.index) == (step.pattern, step.lighting, step.index)
+    return same and lit.exposure != step.exposure

@@ -153,6 +153,20 @@ class PatternScan(Scan, frozen=True, kw_only=True):
     """A scan of a fixed set of patterns."""
 
     average: Annotated[Count, Meta(description="frames averaged a pattern (the paper: 32)")] = 1
+    #: Components are in counts of the run's own exposure, which need not be one of these. On a
+    #: recording each pattern's images follow one another in this order, references too.
+    bracket: (
+        Annotated[
+            tuple[Positive, ...],
+            Meta(
+                min_length=2,
+                max_length=16,
+                description="exposures of each pattern, as parts or multiples of the run's own, "
+                "merged: 0.25,1,4",
+            ),
+        ]
+        | None
+    ) = None
     lit_fraction: LitFraction | None = None  # None: the pattern's own
     estimator: Annotated[Literal["auto", "maxmin", "topk", "lsq"], Meta(description=ESTIMATOR)] = (
         "auto"

@@ -39,6 +39,7 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     warp: tuple[float, ...] | None = None  # 2x3 affine, row by row: frame -> reference
     delay_us: float = 0.0  # of the exposure's start, after the light was said to be the pattern's
     exposure_us: float = 0.0  # as the device gave it; 0: unknown
+    exposure: float = 1.0  # of a bracket: as it was asked for, of the run's own
 
 
 class Quality(enum.IntFlag):
@@ -124,8 +125,9 @@ class Estimator(Protocol):
     """Frames in, components (or a measurement) out."""
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """Take in one frame, (H, W) or (H, W, 3), uint8 or uint16; `pixels` is only read, and not
-        kept. Unused observations are counted, not more."""
+        """Take in one frame, (H, W) or (H, W, 3), uint8 or uint16 (float32 light where the response
+        is a `bracket.Radiance`); `pixels` is only read, and not kept. Unused observations are
+        counted, not more."""
         ...
 
     def result(self) -> Result:

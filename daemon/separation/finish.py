@@ -23,7 +23,7 @@ ADVICE: dict[Quality, tuple[float, str]] = {
     Quality.SATURATED: (
         0.005,
         "of the pixels are saturated, and their components too small: expose more briefly "
-        "(--exposure) or lower the gain",
+        "(--exposure), lower the gain, or bracket exposures of patterns (--bracket 0.25,1)",
     ),
     Quality.NEGATIVE: (
         0.02,

@@ -28,6 +28,7 @@ _ENOUGH = 200  # differences that make a level's deviation
 _SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 _SECOND_DIFFERENCE_NORM = 6.0  # what it makes of independent samples of deviation 1
 _BLOCK = 16
+_QUIET = 0.91  # of pure noise, what the quietest fifth of such blocks has
 _BLOCKS = 12  # blocks that make a level's deviation
 
 
@@ -155,7 +156,7 @@ def from_picture(counts: Plane, full_scale: int, step: int = 1) -> Noise:
     order = np.argsort(level, kind="stable")
     levels, deviations = [], []
     for group in np.array_split(order, min(max(order.size // _BLOCKS, 1), 8)):
-        quiet = float(np.quantile(spread[group], 0.2)) * _MAD / _SECOND_DIFFERENCE_NORM
+        quiet = float(np.quantile(spread[group], 0.2)) * _MAD / _SECOND_DIFFERENCE_NORM / _QUIET
         levels.append(float(np.mean(level[group])))
         deviations.append(max(quiet, _ROUNDING))
     return Noise(tuple(levels), tuple(deviations))

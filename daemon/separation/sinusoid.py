@@ -19,10 +19,12 @@ from daemon.separation import correspondence
 from daemon.separation.blur import of_wave
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
-from daemon.separation.handedness import reversed_pattern, strength
+from daemon.separation.handedness import STRONG, strength
 from daemon.separation.noise import Noise
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
+from daemon.separation.residue import mirrored
+from daemon.separation.ripple import ripple
 from daemon.separation.scan_noise import ResidualNoise
 from daemon.separation.steadiness import compare
 
@@ -40,6 +42,7 @@ _MISFIT = 5.0
 _DOUBTFUL = 2.0
 """Above this it is none where it is also a part of the wave: ..."""
 _DISTORTED = 0.05
+_RIPPLED = 0.03  # of the wave: with more of it in mean or amplitude, light was no sinusoid
 _MANY = 0.2  # of the pixels
 
 
@@ -112,8 +115,10 @@ class LeastSquares:
         quality = np.zeros(direct.shape[:2], dtype=np.uint16)
         if len(solved) > 1:
             quality |= bits(_disagree(solved), Quality.DISAGREE)
-        if self._periods:
-            quality |= bits(self._mirrored(ready[0], noise), Quality.RESIDUE)
+        reflected, told = self._mirrored(ready[0], noise)
+        rippled = self._ripple(ready, noise)
+        if reflected is not None:
+            quality |= bits(reflected, Quality.RESIDUE)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": np.sqrt(direct_var),
             "global_std": np.sqrt(global_var),
@@ -140,10 +145,11 @@ class LeastSquares:
             **self._references.facts(
                 self._references.total(ready[0].solve()[0], self._leakage).source
             ),
-            "mirrors_looked_for": bool(self._periods),
+            **told,
             **steady,
             "misfit": None if misfit is None else round(misfit, 3),
-            "advice": _advice(misfit, self._noise.distortion, disagreeing) + advice,
+            "ripple": None if rippled is None else round(rippled, 4),
+            "advice": _advice(misfit, self._noise.distortion, disagreeing, rippled) + advice,
         }
         return finish(
             direct,
@@ -204,30 +210,50 @@ class LeastSquares:
         """Direct, global and their variances from one frequency."""
         mean, cosine, sine = fit.solve()
         b = self._leakage
-        sigma = self._response.deviation(noise, self._response.counts(mean))
-        mean_var, wave_var = fit.variances()
         power = cosine * cosine + sine * sine
+        of_mean, of_wave = self._response.wave_deviations(noise, mean, np.sqrt(power))
+        mean_var, wave_var = fit.variances()
         if self._noise.measured:
             # |B| of noise alone is not 0: to first order its square is too large by one variance.
-            power = np.maximum(power - np.float32(wave_var) * sigma * sigma, 0)
+            power = np.maximum(power - np.float32(wave_var) * of_wave * of_wave, 0)
         amplitude: Plane = np.sqrt(power)
         direct: Plane = amplitude * np.float32(2.0 * gain / (1.0 - b))
         total = self._references.total(mean, b)
         indirect: Plane = total.light - direct
-        variance = sigma * sigma
-        direct_var: Plane = variance * np.float32(wave_var * (2.0 * gain / (1.0 - b)) ** 2)
-        of_total = np.asarray(mean_var * total.of_half + total.of_frame, dtype=np.float32)
-        total_var: Plane = variance * of_total
+        direct_var: Plane = np.square(of_wave) * np.float32(
+            wave_var * (2.0 * gain / (1.0 - b)) ** 2
+        )
+        total_var = total.of_references(
+            lambda light: self._response.deviation(noise, self._response.counts(light))
+        )
+        total_var += np.square(of_mean) * np.asarray(mean_var * total.of_half, dtype=np.float32)
         return direct, indirect, direct_var, direct_var + total_var
 
-    def _mirrored(self, fit: _Fit, noise: Noise | None) -> NDArray[np.bool_]:
-        """Where the phase runs against the picture's."""
+    def _mirrored(
+        self, fit: _Fit, noise: Noise | None
+    ) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
+        """Where the phase runs against the picture's, or changes faster: see `residue`."""
         _, cosine, sine = fit.solve()
         wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
         if wave.ndim == 3:
             wave = np.asarray(wave.sum(axis=2), dtype=np.complex64)
         deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
-        return reversed_pattern([wave], strength([wave], deviation))
+        even = bool(self._periods)
+        return mirrored([wave], strength([wave], deviation), turning=even, smooth=even)
+
+    def _ripple(self, ready: list[_Fit], noise: Noise | None) -> float | None:
+        """How much of the wave shows in its own mean and amplitude: see `ripple`."""
+        found = []
+        for fit in ready:
+            mean, cosine, sine = fit.solve()
+            wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
+            if wave.ndim == 3:
+                mean = np.asarray(mean.sum(axis=2), dtype=np.float32)
+                wave = np.asarray(wave.sum(axis=2), dtype=np.complex64)
+            deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
+            found.append(ripple(mean, wave, strength([wave], deviation) > np.float32(STRONG)))
+        known = [one for one in found if one is not None]
+        return max(known) if known else None
 
     def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
         mean, _, _ = fit.solve()
@@ -321,7 +347,9 @@ def _disagree(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> NDArray[np.boo
     return differ if differ.ndim == 2 else np.asarray(np.logical_or.reduce(differ, axis=2))
 
 
-def _advice(misfit: float | None, distortion: float | None, disagreeing: float) -> list[str]:
+def _advice(
+    misfit: float | None, distortion: float | None, disagreeing: float, rippled: float | None
+) -> list[str]:
     """What to do about frames that are no sinusoids in time; [] where they are."""
     lines = []
     if misfit is not None and (
@@ -331,6 +359,13 @@ def _advice(misfit: float | None, distortion: float | None, disagreeing: float) 
             f"the frames are {misfit:.0f} times further from a sinusoid than noise takes them: "
             "they are not the phases that were declared (--phases, --periods), the tone curve is "
             "not linear, or something moved"
+        )
+    elif rippled is not None and rippled > _RIPPLED:
+        lines.append(
+            f"the pattern itself shows in the components, by {rippled:.0%} of the wave: the "
+            "projector's or the camera's tone curve is not linear (run `umbra calibrate tone`, or "
+            "give the camera's curve with --tone), or the frames are not the phases that were "
+            "declared (--phases)"
         )
     if disagreeing > _MANY:
         lines.append(

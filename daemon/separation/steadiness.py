@@ -19,6 +19,9 @@ from daemon.separation.finish import bits
 from daemon.separation.radiometry import Plane
 from daemon.separation.references import References
 
+HALF = 0.02
+"""Lit fractions so near to a half are one."""
+
 _DEVIATIONS = 6.0
 _PART = 0.1  # of the light: less is a bend of a tone curve, or light that was not smooth
 _OFF = 0.02  # of the light, all over the picture
