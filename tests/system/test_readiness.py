@@ -221,3 +221,14 @@ def test_the_exposure_is_chosen_by_hand_for_what_is_shown(daemon: Daemon) -> Non
         facts = rig.auto_exposure(longest_us=2000.0)
         assert facts["exposure_us"] == 2000.0
         assert "too dark at the longest exposure" in facts["problem"]
+
+
+def test_the_exposures_of_a_bracket_are_multiples_of_the_chosen_one(daemon: Daemon) -> None:
+    daemon.configure(projector="refresh_hz = 500")
+    spec = umbra.TwoImage(auto_exposure=True, exposure_us=100_000.0, bracket=(1.0, 2.0))
+    with daemon.start() as rig:
+        run = rig.scan(spec)
+        assert run.wait(60).state is RunState.DONE
+    chosen = rig_of(daemon, run.id)["exposure"]["exposure_us"]
+    records = FrameStore.open(daemon.data / "runs" / run.id, readonly=True).records()
+    assert {r.exposure_us for r in records} == {chosen, 2 * chosen}
