@@ -6,10 +6,11 @@ lease, a lock has a heartbeat; when either is over, the rig goes to its safe sta
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
@@ -194,6 +195,15 @@ class Manual:
 
     # ------------------------------------------------------------ acts
 
+    @contextlib.contextmanager
+    def _noticed(self) -> Iterator[None]:
+        """What a device says meanwhile counts for its health: a lost one is connected again."""
+        try:
+            yield
+        except DeviceError as error:
+            self._rig.failed(error)
+            raise
+
     def show(self, pattern: AnyPattern, lease_s: float) -> None:
         """Show a pattern until the lease is over. Raises UmbraError, DeviceError."""
         projector = self._rig.projector
@@ -206,7 +216,8 @@ class Manual:
             session = self.use(lease_s)
         info = projector.device.info()
         image = render(pattern, info.width, info.height)
-        projector.call(lambda p: p.show(image), SHOW_S, session)
+        with self._noticed():
+            projector.call(lambda p: p.show(image), SHOW_S, session)
 
     def look(
         self, rate_hz: float, lease_s: float, separate: SingleImage | None, bench: Bench | None
@@ -230,7 +241,8 @@ class Manual:
             known = ", ".join(self._rig.lights) or "none"
             raise UmbraError(Code.DEVICE_MISSING, f"no light {name!r}: this rig has {known}")
         session = self.use(_LIGHT_S if on else _FRAME_S)
-        thread.call(lambda light: light.set(on), CALL_S, session)
+        with self._noticed():
+            thread.call(lambda light: light.set(on), CALL_S, session)
 
     def snap(self) -> tuple[Frame, CameraInfo]:
         """Take one frame as things are. Raises UmbraError, DeviceError."""
@@ -239,11 +251,8 @@ class Manual:
         session = self.use(_FRAME_S)
 
         try:
-            with self.live.aside():
+            with self._noticed(), self.live.aside():
                 frame, info = snap(camera, session)
-        except DeviceError as error:
-            self._rig.failed(error)
-            raise
         finally:
             if not was_active:
                 self.end()
@@ -286,7 +295,7 @@ class Manual:
             return device.configure(wanted)
 
         try:
-            with self.live.aside():
+            with self._noticed(), self.live.aside():
                 return camera.call(set_camera, CALL_S, session)
         finally:
             if not was_active:

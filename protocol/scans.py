@@ -204,6 +204,9 @@ class OccluderScan(Scan, frozen=True, kw_only=True):
     sun: Annotated[
         bool, Meta(description="the source drifts and clouds pass: follow its strength")
     ] = False
+    align: Annotated[
+        bool, Meta(description="find the camera's shake, and align or reject what it moved")
+    ] = True
     drift_deg: Annotated[
         Positive,
         Meta(description="how far the sun may have gone when an interrupted scan is resumed"),
