@@ -237,6 +237,9 @@ class _Daemon:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        for number in (signal.SIGTERM, signal.SIGINT):  # one more is no reason to die of it
+            asyncio.get_running_loop().remove_signal_handler(number)
+            signal.signal(number, signal.SIG_IGN)
 
     async def _let_go(self, rig: Rig, running: asyncio.Task[None] | None) -> None:
         """Wait for the run to be written to its end, and close the devices."""

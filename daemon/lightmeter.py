@@ -51,6 +51,14 @@ def require_meterable(spec: Spec, bench: Bench) -> None:
         raise Unsuitable("in the dark there is no light to look at", where)
 
 
+def limits_of(rig: Rig, longest_us: float | None) -> Limits:
+    """What bounds an exposure under the rig's projector, if it has one: whole periods of it."""
+    shortest, longest = rig.camera.device.info().exposure_range_us
+    longest = min(longest, longest_us or LONGEST_US)
+    refresh_hz = rig.projector.device.info().refresh_hz if rig.projector is not None else 0.0
+    return Limits(shortest, max(shortest, longest), 1e6 / refresh_hz if refresh_hz > 0 else None)
+
+
 class LightMeter:
     """Measures for one run. Calls block: for the run's thread."""
 
@@ -93,17 +101,14 @@ class LightMeter:
 
     def limits(self) -> Limits:
         """What bounds the exposure: the camera, the spec, a stream's pace, the projector's."""
+        if not isinstance(self._spec, OccluderScan):
+            return limits_of(self._rig, self._spec.exposure_us)
         camera = self._rig.camera.device
         shortest, longest = camera.info().exposure_range_us
         longest = min(longest, self._spec.exposure_us or LONGEST_US)
-        period = None
-        if isinstance(self._spec, OccluderScan):
-            rate = self._spec.frame_rate_hz or camera.settings().frame_rate_hz
-            longest = min(longest, 1e6 / rate if rate else longest)
-        elif self._rig.projector is not None:
-            refresh_hz = self._rig.projector.device.info().refresh_hz
-            period = 1e6 / refresh_hz if refresh_hz > 0 else None
-        return Limits(shortest, max(shortest, longest), period)
+        rate = self._spec.frame_rate_hz or camera.settings().frame_rate_hz
+        longest = min(longest, 1e6 / rate if rate else longest)
+        return Limits(shortest, max(shortest, longest))
 
     def _picture(self, settings: CameraSettings) -> Level:
         """Tried again where none came, or half of one: a picture has no effect."""

@@ -12,17 +12,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import structlog
 
 from daemon.devicethread import Session
+from daemon.lightmeter import LONGEST_US, limits_of
 from daemon.live import Live
 from daemon.manualstage import ManualStage
+from daemon.metering import Exposure, Level, choose, level_of
 from daemon.patterns import render
 from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench
 from daemon.scans.single_image import SingleImageMethod
+from daemon.separation.radiometry import Response
 from daemon.sequencer import CALL_S, SHOW_S
 from daemon.snapshot import snap
 from daemon.viewfinder import Viewfinder
@@ -33,6 +36,7 @@ from protocol.patterns import AnyPattern, Stripes
 from protocol.scans import SingleImage
 
 _FRAME_S = 2.0
+_EXPOSE_S = 120.0
 _LIGHT_S = 600.0
 """How long a light that was switched on by hand stays on when nobody asks again."""
 OWNER = "manual work"
@@ -254,6 +258,29 @@ class Manual:
                 self.end()
         self._viewfinder.offer(frame, info, now=True)
         return frame, info
+
+    def expose(self, wanted: CameraSettings, response: Response) -> Exposure:
+        """Choose the exposure for the scene as it is lit now; that of `wanted` is the longest, the
+        rest is set. See `daemon.metering.choose`. Raises UmbraError, DeviceError."""
+        camera = self._rig.camera
+        start = camera.device.settings().exposure_us or LONGEST_US / 100
+        was_active = self.active
+        session = self.use(_EXPOSE_S)
+
+        def look(exposure_us: float) -> Level:
+            frame, info = snap(camera, session, replace(wanted, exposure_us=exposure_us))
+            self._viewfinder.offer(frame, info, now=True)
+            return level_of(frame.pixels, response, frame.exposure_us or exposure_us)
+
+        try:
+            with self.live.aside():
+                return choose(look, start, limits_of(self._rig, wanted.exposure_us))
+        except DeviceError as error:
+            self._rig.failed(error)
+            raise
+        finally:
+            if not was_active:
+                self.end()
 
     def configure(self, wanted: CameraSettings) -> CameraSettings:
         """Change camera settings; gives those in force. Raises UmbraError, DeviceError."""

@@ -33,7 +33,7 @@ from daemon.viewfinder import Viewfinder
 from drivers.base import CameraInfo, CameraSettings, DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages import Waiting
-from protocol.scans import OccluderScan, Radiometry, Scan
+from protocol.scans import AnyScan, OccluderScan, Radiometry, Scan
 
 log = structlog.get_logger(__name__)
 
@@ -124,13 +124,13 @@ class Preparation:
             exposure = self._meter(session, wanted).choose()
             log.info("exposure chosen", **exposure.facts())
             wanted = replace(wanted, exposure_us=exposure.exposure_us)
-        self._settings = self._configure(session, wanted)
+            self._settings = self._configure(session, wanted)
         calibration = file.calibration if resuming else None
         if calibration is None:
             calibration = self._calibration()
         bench = self._rig.bench(calibration["values"])
         return Prepared(
-            method=method_for(spec, bench),
+            method=method_for(self._as_exposed(), bench),
             camera=bench.camera,
             settings=self._settings,
             calibration=calibration,
@@ -166,6 +166,12 @@ class Preparation:
         if isinstance(spec, OccluderScan) and spec.frame_rate_hz is not None:
             wanted = replace(wanted, frame_rate_hz=spec.frame_rate_hz)
         return wanted
+
+    def _as_exposed(self) -> AnyScan:
+        """The spec with the exposure that was chosen, for methods to reckon with."""
+        if not self._spec.auto_exposure:
+            return self._spec
+        return msgspec.structs.replace(self._spec, exposure_us=self._settings.get("exposure_us"))
 
     def _configure(self, session: Session, wanted: CameraSettings) -> dict[str, Any]:
         camera = self._rig.camera

@@ -446,10 +446,15 @@ class Snap(Command, frozen=True, kw_only=True, tag="snap"):
 
 
 class SetCamera(Command, frozen=True, kw_only=True, tag="camera"):
-    """Change camera settings (none given: only read); answers with those in force."""
+    """Change camera settings (none given: only read); answers with those in force.
+
+    With `auto_exposure` the exposure is then chosen by pictures of the scene as it is lit now; an
+    exposure that is given is the longest.
+    """
 
     role: ClassVar[Role] = Role.OPERATOR
     settings: CameraSettings = CameraSettings()
+    auto_exposure: bool = False
 
 
 class SetLight(Command, frozen=True, kw_only=True, tag="light"):
@@ -643,9 +648,11 @@ class Picture(Reply, frozen=True, kw_only=True, tag="picture"):
 
 
 class Camera(Reply, frozen=True, kw_only=True, tag="camera"):
-    """Answer to `camera`: the settings in force."""
+    """Answer to `camera`: the settings in force. `facts`: of auto-exposure, what it came to; with a
+    `problem` where the level is not as it should be."""
 
     settings: CameraSettings
+    facts: dict[str, Any] = {}
 
 
 class StageStatus(Reply, frozen=True, kw_only=True, tag="stage"):

@@ -469,6 +469,19 @@ def test_keys_from_new_to_revoked(tmp_path: Path, capsys: Captured) -> None:
     assert "no key named anna" in capsys.readouterr().err
 
 
+def test_auto_exposure_is_asked_for_after_the_other_settings(rig: Rig, capsys: Captured) -> None:
+    assert run(["camera", "--auto-exposure", "--exposure-us", "500", "--gain", "6"]) == Exit.OK
+    sent = [r.command for r in rig.requests if isinstance(r.command, m.SetCamera)]
+    assert sent == [
+        m.SetCamera(settings=m.CameraSettings(gain=6.0)),
+        m.SetCamera(settings=m.CameraSettings(exposure_us=500.0), auto_exposure=True),
+        m.SetCamera(),
+    ]
+    told = capsys.readouterr()
+    assert "55.0% of full scale" in told.out
+    assert told.err.strip() == "umbra: too dark"
+
+
 # ---------------------------------------------------------------- stage, doctor, devices, log
 
 

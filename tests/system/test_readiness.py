@@ -206,3 +206,29 @@ def test_what_the_dark_cannot_say_is_refused(daemon: Daemon) -> None:
     dark = "in the dark there is no light to look at"
     with daemon.start() as rig, pytest.raises(UmbraError, match=dark):
         rig.scan(umbra.CalibrateDark(auto_exposure=True))
+
+
+def test_the_exposure_is_chosen_by_hand_for_what_is_shown(daemon: Daemon) -> None:
+    daemon.configure(projector="refresh_hz = 500")
+    with daemon.start() as rig:
+        rig.camera(exposure_us=200.0)
+        rig.show(umbra.WHITE)
+        facts = rig.auto_exposure()
+        assert facts["exposure_us"] == rig.camera().exposure_us
+        assert facts["exposure_us"] % 2000 == pytest.approx(0.0, abs=0.1)
+        assert 0.65 < facts["brightest"] < 0.84
+        assert rig.status().state is RigState.MANUAL  # white is still shown
+        facts = rig.auto_exposure(longest_us=2000.0)
+        assert facts["exposure_us"] == 2000.0
+        assert "too dark at the longest exposure" in facts["problem"]
+
+
+def test_the_exposures_of_a_bracket_are_multiples_of_the_chosen_one(daemon: Daemon) -> None:
+    daemon.configure(projector="refresh_hz = 500")
+    spec = umbra.TwoImage(auto_exposure=True, exposure_us=100_000.0, bracket=(1.0, 2.0))
+    with daemon.start() as rig:
+        run = rig.scan(spec)
+        assert run.wait(60).state is RunState.DONE
+    chosen = rig_of(daemon, run.id)["exposure"]["exposure_us"]
+    records = FrameStore.open(daemon.data / "runs" / run.id, readonly=True).records()
+    assert {r.exposure_us for r in records} == {chosen, 2 * chosen}
