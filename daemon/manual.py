@@ -6,14 +6,14 @@ lease, a lock has a heartbeat; when either is over, the rig goes to its safe sta
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
 
-import numpy as np
 import structlog
 
 from daemon.devicethread import Session
@@ -24,8 +24,9 @@ from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench
 from daemon.scans.single_image import SingleImageMethod
 from daemon.sequencer import CALL_S, SHOW_S
+from daemon.snapshot import snap
 from daemon.viewfinder import Viewfinder
-from drivers.base import Acquisition, Camera, CameraInfo, CameraSettings, DeviceError, Frame
+from drivers.base import Camera, CameraInfo, CameraSettings, DeviceError, Frame
 from protocol.errors import Code, UmbraError
 from protocol.messages import AnyEvent, LockInfo
 from protocol.patterns import AnyPattern, Stripes
@@ -190,6 +191,15 @@ class Manual:
 
     # ------------------------------------------------------------ acts
 
+    @contextlib.contextmanager
+    def _noticed(self) -> Iterator[None]:
+        """What a device says meanwhile counts for its health: a lost one is connected again."""
+        try:
+            yield
+        except DeviceError as error:
+            self._rig.failed(error)
+            raise
+
     def show(self, pattern: AnyPattern, lease_s: float) -> None:
         """Show a pattern until the lease is over. Raises UmbraError, DeviceError."""
         projector = self._rig.projector
@@ -202,7 +212,8 @@ class Manual:
             session = self.use(lease_s)
         info = projector.device.info()
         image = render(pattern, info.width, info.height)
-        projector.call(lambda p: p.show(image), SHOW_S, session)
+        with self._noticed():
+            projector.call(lambda p: p.show(image), SHOW_S, session)
 
     def look(
         self, rate_hz: float, lease_s: float, separate: SingleImage | None, bench: Bench | None
@@ -226,7 +237,8 @@ class Manual:
             known = ", ".join(self._rig.lights) or "none"
             raise UmbraError(Code.DEVICE_MISSING, f"no light {name!r}: this rig has {known}")
         session = self.use(_LIGHT_S if on else _FRAME_S)
-        thread.call(lambda light: light.set(on), CALL_S, session)
+        with self._noticed():
+            thread.call(lambda light: light.set(on), CALL_S, session)
 
     def snap(self) -> tuple[Frame, CameraInfo]:
         """Take one frame as things are. Raises UmbraError, DeviceError."""
@@ -234,25 +246,9 @@ class Manual:
         was_active = self.active
         session = self.use(_FRAME_S)
 
-        def take(cam: Camera) -> tuple[Frame, CameraInfo]:
-            info = cam.info()
-            out = np.zeros(info.shape, info.pixel_format.dtype)
-            cam.stop()  # a live view may have left it acquiring
-            cam.start(Acquisition.SOFTWARE)
-            try:
-                cam.trigger()
-                exposure_s = (cam.settings().exposure_us or 0.0) * 1e-6
-                return cam.grab(out, exposure_s + info.readout_s + _FRAME_S), info
-            finally:
-                cam.stop()
-
-        exposure_s = (camera.device.settings().exposure_us or 0.0) * 1e-6
         try:
-            with self.live.aside():
-                frame, info = camera.call(take, exposure_s + 2 * CALL_S, session)
-        except DeviceError as error:
-            self._rig.failed(error)
-            raise
+            with self._noticed(), self.live.aside():
+                frame, info = snap(camera, session)
         finally:
             if not was_active:
                 self.end()
@@ -272,7 +268,7 @@ class Manual:
             return device.configure(wanted)
 
         try:
-            with self.live.aside():
+            with self._noticed(), self.live.aside():
                 return camera.call(set_camera, CALL_S, session)
         finally:
             if not was_active:

@@ -316,7 +316,9 @@ class Rig:
         # The projector first: light is what a person in front of it notices.
         members = sorted(self._members.values(), key=lambda m: m.device.kind != "projector")
         return [
-            m.thread.submit(lambda d: d.safe(), SAFE_S) for m in members if m.identity is not None
+            m.thread.submit(lambda d: d.safe(), SAFE_S)
+            for m in members
+            if m.identity is not None and not m.thread.ended  # closed: it was made safe before
         ]
 
     def safe_within(self, futures: list[Future[None]], seconds: float) -> bool:

@@ -192,12 +192,20 @@ class Sequencer:
             self._light(step)
         for sub in range(first, step.frames):
             self._settle()
+            self._pause_within(step)
             if self._lit is not step:  # settling had to show an earlier pattern again
                 self._light(step)
             self._pending = self._trigger(index, step, sub, attempt=1)
             if sub + 1 == step.frames:
                 self._draw_ahead(index + 1)
             self._await_exposure(self._pending)
+
+    def _pause_within(self, step: Expose) -> None:
+        """A pause in the middle of a step: the frames of a long one would fill the ring while the
+        disk is full."""
+        if self._control.checkpoint(self._session, self._paused):
+            self._acquire(Acquisition.SOFTWARE)
+            self._light(step)
 
     def _set_exposure(self, wanted_us: float | None) -> None:
         """Expose for so long from now on; None: as the run began."""
@@ -217,8 +225,11 @@ class Sequencer:
     def _digest(self) -> None:
         """Wait until the estimator knows every frame so far."""
         self._settle()
-        if not self._recorder.digested(_RING_S):
-            raise Behind
+        while not self._recorder.digested(_RING_S):
+            if not self._control.paused:
+                raise Behind
+            if self._control.checkpoint(self._session, self._paused):
+                self._acquisition = None
 
     def _light(self, step: Expose) -> None:
         """Make the light this step's; `_lit_ns` says from when it is."""
@@ -256,10 +267,11 @@ class Sequencer:
             self._image(step)
 
     def _trigger(self, index: int, step: Expose, sub: int, attempt: int) -> _Exposure:
-        buffer = self._ring.take(_RING_S)
-        if buffer is None:
+        while (buffer := self._ring.take(_RING_S)) is None:
             self._recorder.check()
-            raise Behind
+            if not self._control.paused:
+                raise Behind
+            self._pause_within(step)  # the disk is full
         if self._projector is not None:
             begin = self._lit_ns + round(step.delay_s * NS)
             self._clock.wait_until(begin, self._session.ended)
@@ -408,6 +420,8 @@ class Sequencer:
         buffer = self._ring.take(_RING_S if self._info.recorded else 0.0)
         behind = buffer is None
         if buffer is None:
+            if self._info.recorded and self._control.paused:
+                return sub, last  # the disk is full
             if self._info.recorded:
                 raise Behind
             buffer = np.empty(self._info.shape, self._info.pixel_format.dtype)

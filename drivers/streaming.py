@@ -70,6 +70,7 @@ class Buffer:
     release: Callable[[], None]
     stride: int | None = None  # bytes from row to row; None: rows follow without a gap
     incomplete: bool = False
+    pixel_code: int | None = None  # the format's number as the frame itself has it; None: unsaid
 
 
 class StreamingCamera(Camera):

@@ -24,7 +24,7 @@ from typing import (
 from protocol import messages as m
 from protocol.connection import Ask, checked, expect
 from protocol.messages import CameraSettings, RunInfo, RunState
-from protocol.patterns import AnyPattern
+from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.results import (
     Part,
     Picture,
@@ -222,8 +222,12 @@ class Commands:
         return Ask(m.StopLive(), message_of, SLOW_S)
 
     @command
-    def show(self, pattern: AnyPattern, lease_s: float = 600.0) -> Ask[str]:
+    def show(
+        self, pattern: AnyPattern | Literal["white", "black"], lease_s: float = 600.0
+    ) -> Ask[str]:
         """Show a pattern by hand; the projector goes dark after `lease_s`."""
+        if isinstance(pattern, str):
+            pattern = {"white": WHITE, "black": BLACK}[pattern]
         return Ask(m.Show(pattern=pattern, lease_s=lease_s), message_of)
 
     @command

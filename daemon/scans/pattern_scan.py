@@ -16,7 +16,7 @@ from daemon.scans.calibrate_dark import exposure_of
 from daemon.scans.method import Bench, Expose, Method, Step, Taken, Unsuitable
 from daemon.separation.bracket import Bracketed
 from daemon.separation.estimator import Estimator, Lighting, Observation
-from daemon.separation.exposure_noise import Sensor
+from daemon.separation.exposure_noise import ROUNDING, Sensor
 from daemon.separation.extremes import MaxMin
 from daemon.separation.frameset import FrameSet, Watched
 from daemon.separation.radiometry import Response
@@ -237,14 +237,13 @@ class PatternMethod(Method[P]):
         """See `Method`. Exposures of a bracket are merged before the method's own estimator."""
         if self.spec.bracket is None:
             return self._watched(self.response, self.spec.average)
-        known = (self.bench.calibration or {}).get("noise")
         return Bracketed(
             self.response,
             lambda response: self._watched(response, 1),
             factors=self.spec.bracket,
             average=self.spec.average,
             own_us=self._own_us,
-            sensor=None if not known else Sensor(known["read_counts"] ** 2, known["counts_per_e"]),
+            sensor=self._sensor(),
         )
 
     def _watched(self, response: Response, average: int) -> Estimator:
@@ -260,6 +259,13 @@ class PatternMethod(Method[P]):
     def distinct(self) -> bool:
         """Whether no two patterns are alike."""
         return True
+
+    def _sensor(self) -> Sensor | None:
+        """The camera's noise as calibrated; None where it is not, or counts are not linear."""
+        known = (self.bench.calibration or {}).get("noise")
+        if known is None or not self.response.is_linear:
+            return None
+        return Sensor(known["read_counts"] ** 2 + ROUNDING, known["counts_per_e"])
 
     @abstractmethod
     def separator(self, response: Response, average: int) -> Estimator:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -42,8 +42,8 @@ from daemon.separation.noise import Noise
 from daemon.separation.radiometry import FrameMean, Plane, Response
 
 CROSSOVER = 0.01
-"""q where no calibration tells it, of full scale: read and shot noise are alike there. Weights for
-a q that is quite wrong cost a tenth of the deviation."""
+"""q where no calibration tells it, of full scale: read and shot noise are alike there. A q that is
+quite wrong costs 8 % more deviation for shot noise alone, 27 % for none (exposures 1, 4, 16)."""
 
 _OFF = 0.03  # of the ratio of two exposures: from here it is said
 
@@ -96,7 +96,7 @@ class Radiance(Response):
 
     factors: tuple[float, ...] = (1.0,)
     average: int = 1
-    noise: ExposureNoise | None = field(default=None, compare=False)
+    meter: ExposureNoise | None = field(default=None, compare=False)
     crossover: float = 1.0
 
     @classmethod
@@ -105,16 +105,19 @@ class Radiance(Response):
         response: Response,
         factors: Sequence[float],
         average: int,
-        noise: ExposureNoise,
+        meter: ExposureNoise,
         crossover: float,
     ) -> Radiance:
         """For frames of a camera merged from so many exposures of `average` frames."""
-        given = {one.name: getattr(response, one.name) for one in fields(Response)}
         return cls(
-            **given,
+            full_scale=response.full_scale,
+            black=response.black,
+            tone=response.tone,
+            saturation=response.saturation,
+            bayer=response.bayer,
             factors=tuple(sorted(factors)),
             average=average,
-            noise=noise,
+            meter=meter,
             crossover=crossover,
         )
 
@@ -136,7 +139,7 @@ class Radiance(Response):
     @property
     def camera(self) -> Response:
         """The camera's own response."""
-        return Response(**{one.name: getattr(self, one.name) for one in fields(Response)})
+        return Response(self.full_scale, self.black, self.tone, self.saturation, self.bayer)
 
     def linear(self, counts: NDArray[Any]) -> Plane:
         """Merged frames are linear."""
@@ -159,8 +162,8 @@ class Radiance(Response):
         the rounding of counts alone."""
         light = np.maximum(np.asarray(counts, dtype=np.float32), np.float32(0.0))
         sensor = Sensor(0.0, 0.0)
-        if noise is not None and self.noise is not None:
-            sensor = self.noise.sensor()
+        if noise is not None and self.meter is not None:
+            sensor = self.meter.sensor()
         camera = self.camera
         limit = _limit(self)
         colours = light.max(axis=2, keepdims=True) if light.ndim == 3 else light  # see `spoiled`

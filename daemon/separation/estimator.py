@@ -37,6 +37,7 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     weight: float = 1.0
     strength: float = 1.0  # of the source in this frame, relative to the run's reference
     warp: tuple[float, ...] | None = None  # 2x3 affine, row by row: frame -> reference
+    fresh: bool = False  # the collection begins anew with this frame: none before it is used
     delay_us: float = 0.0  # of the exposure's start, after the light was said to be the pattern's
     exposure_us: float = 0.0  # as the device gave it; 0: unknown
     exposure: float = 1.0  # of a bracket: as it was asked for, of the run's own

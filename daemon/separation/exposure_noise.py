@@ -21,7 +21,7 @@ ROUNDING = 1.0 / 12.0
 """Variance of a count's rounding error."""
 
 _SAMPLE = 3  # each third row and column: all colours of a mosaic
-_LEVELS = 16
+_LEVELS = 24
 _ENOUGH = 50  # samples of a level
 _OUTLIER = 4.0  # deviations
 
@@ -68,8 +68,8 @@ class ExposureNoise:
     """The sensor's noise, from pairs of exposures of one pattern; constant memory.
 
     A sample of the shorter exposure less the longer's, scaled to it by ρ < 1, is noise of variance
-    (1/n + ρ²/m) read + (1/n + ρ/m) shot x, for means of n and m frames. Its median at a level is
-    what is wrong with ρ, and is taken off.
+    (1/n + ρ²/m) read + (1/n + ρ/m) shot x, for means of n and m frames. Its median at a level, and
+    what grows with the level, is what is wrong with ρ, and is taken off.
     """
 
     def __init__(self, response: Response, known: Sensor | None = None) -> None:
@@ -87,28 +87,30 @@ class ExposureNoise:
         level = (long.light[::_SAMPLE, ::_SAMPLE] * np.float32(ratio))[good]
         apart = short.light[::_SAMPLE, ::_SAMPLE][good] - level
         top = self._response.linear_full_scale * ratio
-        bins = np.clip(level * np.float32(_LEVELS / top), 0, _LEVELS - 1).astype(np.intp)
+        root = np.sqrt(np.maximum(level, 0.0) * np.float32(1.0 / top))  # even in what noise does
+        bins = np.minimum(root * np.float32(_LEVELS), _LEVELS - 1).astype(np.intp)
         rows = self._rows.setdefault(names, np.zeros((6, _LEVELS)))
         order = np.argsort(bins, kind="stable")
-        for index, group in enumerate(
-            np.split(order, np.searchsorted(bins[order], np.arange(1, _LEVELS)))
-        ):
-            if group.size < _ENOUGH:
-                continue
-            off = apart[group].astype(np.float64)
-            middle = float(np.median(off))
-            off -= middle
+        groups = np.split(order, np.searchsorted(bins[order], np.arange(1, _LEVELS)))
+        usable = [index for index, group in enumerate(groups) if group.size >= _ENOUGH]
+        at = {n: float(np.mean(level[groups[n]], dtype=np.float64)) for n in usable}
+        middle = {n: float(np.median(apart[groups[n]])) for n in usable}
+        slope = sum(at[n] * middle[n] for n in usable) / max(sum(at[n] ** 2 for n in usable), 1e-9)
+        for index in usable:
+            group = groups[index]
+            off = apart[group] - middle[index] - slope * (level[group] - at[index])
+            off = off.astype(np.float64)
             limit = _OUTLIER * (1.4826 * float(np.median(np.abs(off))) + 1.0)
             kept = off[np.abs(off) <= limit]
-            at = max(float(np.mean(level[group], dtype=np.float64)), 0.0)
+            light = max(at[index], 0.0)
             rows[:, index] += kept.size * np.array(
                 [
                     1.0,
                     float(np.mean(kept**2)),
                     1.0 / short.frames + ratio**2 / long.frames,
-                    (1.0 / short.frames + ratio / long.frames) * at,
-                    at,
-                    middle,
+                    (1.0 / short.frames + ratio / long.frames) * light,
+                    light,
+                    middle[index],
                 ]
             )
 
@@ -153,5 +155,5 @@ class ExposureNoise:
             square = float(np.sum(levels**2 / samples))
             if square > 0:
                 off = float(np.sum(middles * levels / samples)) / square
-                found[short, long] = long / short * (1.0 - off)
+                found[short, long] = long / short / max(1.0 + off, 1e-9)
         return found

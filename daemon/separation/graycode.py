@@ -147,22 +147,22 @@ class GrayCodeDecoder:
         total = self._references.total(half, b)
         moved, steady, advice = compare(self._references, half, deviation, b)
         indirect: Plane = total.light - direct
-        direct_std = deviation * np.float32(np.sqrt(2.0) / (1.0 - b))
-        share = np.asarray(
-            total.of_half * np.float32(0.5 / self._pairs) + total.of_frame * self._average,
-            dtype=np.float32,
-        )
-        global_std: Plane = np.sqrt(direct_std**2 + deviation**2 * share)
+        step = contrast * np.float32(0.5)
+        pair_var = np.square(self._noise.deviation(half + step))
+        pair_var += np.square(self._noise.deviation(half - step))
+        direct_std: Plane = np.sqrt(pair_var) * np.float32(1.0 / (1.0 - b))
+        global_var = total.of_references(self._noise.deviation) * np.float32(self._average)
+        global_var += pair_var * np.asarray(total.of_half * (0.25 / self._pairs), np.float32)
+        global_std: Plane = np.sqrt(direct_std**2 + global_var)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": direct_std,
             "global_std": global_std,
             "stripe": stripe,
         }
-        limit = np.float32(SIGNIFICANT) * _grey(deviation)
-        for axis, code in self._codes.items():
-            planes["column" if axis == "x" else "row"] = code.decode(limit)
+        coordinates = self.coordinates(np.float32(SIGNIFICANT) * _grey(deviation))
+        planes.update(coordinates)
         told = mirrored_coordinates(
-            {name: planes[name] for name in ("column", "row") if name in planes},
+            coordinates,
             self._strength(contrast, pair, deviation),
             self._stripes(),
         )
@@ -201,6 +201,14 @@ class GrayCodeDecoder:
                 "advice": unequal + told.advice + advice,
             },
         )
+
+    def coordinates(self, limit: Plane) -> dict[str, Plane]:
+        """`column` and `row` (H, W) in projector pixels, as far as they are coded; NaN where a
+        coarse stripe differs from its inverse by less than `limit` (H, W, linear counts)."""
+        return {
+            "column" if axis == "x" else "row": code.decode(limit)
+            for axis, code in self._codes.items()
+        }
 
     def _strength(self, contrast: Plane, pair: Plane, deviation: Plane) -> Plane:
         """Contrast of the stripes by its noise; 0 where little light is direct, for there the

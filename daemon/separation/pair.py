@@ -106,14 +106,17 @@ class ComplementPair:
         b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
         h = light_model.global_weight(1.0 - self._alpha, b)
         singular = min(light_model.complement_determinants(self._alpha, b))
-        ambient = 0.0  # of its variance in one frame's, in L_g = (I_unlit - A - b(I_lit - A))/det
+        unlit_var = np.square(least)  # in L_g = (I_unlit - A - b(I_lit - A))/det
         for kind in (Lighting.AMBIENT, Lighting.BLACK):
-            if not ambient and self._references.frames(kind):
-                ambient = self._average * (1.0 - b) ** 2 / self._references.frames(kind)
+            reference = self._references.mean(kind)
+            if reference is not None:
+                share = self._average * (1.0 - b) ** 2 / self._references.frames(kind)
+                unlit_var += np.square(self._noise.deviation(reference)) * np.float32(share)
+                break
         return {
             "direct_std": np.hypot(most * np.float32(h), least * np.float32(g))
             * np.float32(1.0 / singular),
-            "global_std": np.hypot(most * np.float32(b), least * np.float32(np.sqrt(1.0 + ambient)))
+            "global_std": np.sqrt(unlit_var + np.square(most * np.float32(b)))
             * np.float32(1.0 / singular),
         }
 

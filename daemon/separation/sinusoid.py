@@ -228,8 +228,10 @@ class LeastSquares:
         direct_var: Plane = np.square(of_wave) * np.float32(
             wave_var * (2.0 * gain / (1.0 - b)) ** 2
         )
-        of_total = np.asarray(mean_var * total.of_half + total.of_frame, dtype=np.float32)
-        total_var: Plane = np.square(of_mean) * of_total
+        total_var = total.of_references(
+            lambda light: self._response.deviation(noise, self._response.counts(light))
+        )
+        total_var += np.square(of_mean) * np.asarray(mean_var * total.of_half, dtype=np.float32)
         return direct, indirect, direct_var, direct_var + total_var
 
     def _mirrored(

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 LIVE = {
     *("exposure_us", "gain", "references", "lights", "frame_rate_hz", "feed_mm_s"),
     *("coverage", "time_limit_s", "sweeps", "sweep_mm", "radius_mm", "centre_mm"),
+    *("auto_exposure", "deadline_s", "light_min", "light_max", "steady", "look_s"),
 }
 """Fields that are no options here: the photographs have them, or the files given say them."""
 TYPED = {"path": "DIR", "match": "--match", "bayer": "--bayer"}

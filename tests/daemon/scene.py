@@ -39,6 +39,7 @@ class Scene:
     reach: float = 40.0  # of global light, px
     gamma: float = 1.0  # of the projector
     pixel_format: PixelFormat = PixelFormat.MONO16
+    calibration: dict[str, Any] = field(default_factory=dict)  # of the rig
     change: Callable[[NDArray[Any], Expose], NDArray[Any]] = field(default=lambda light, _: light)
 
     def __post_init__(self) -> None:
@@ -81,6 +82,7 @@ class Scene:
         return Bench(
             CameraInfo(self.width, self.height, self.pixel_format),
             ProjectorInfo(self.width, self.height, refresh_hz=60),
+            calibration=self.calibration,
             exposure_us=OWN_US,
         )
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 
 from daemon import patterns
-from daemon.scans.method import Bench
 from daemon.separation import blur
 from protocol.patterns import Sinusoid as Wave
 from protocol.scans import Radiometry, Sinusoid
@@ -36,21 +33,13 @@ def test_a_wave_loses_what_is_said(weave: float) -> None:
 
 def test_a_calibrated_blur_unbiases_a_single_period() -> None:
     scene = Scene(blur=0.9, sigma=0.002)
+    known = Scene(blur=0.9, sigma=0.002, calibration={"optics_blur_px": 0.9})
     spec = Sinusoid(periods=(12,), phases=8, radiometry=Radiometry(leakage=0.0))
-    plain, told = scene.scan(spec), Calibrated(blur=0.9, sigma=0.002).scan(spec)
+    plain, told = scene.scan(spec), known.scan(spec)
     inside = np.s_[8:-8, 8:-8]
     bias = [float(((c.direct - scene.direct) / scene.direct)[inside].mean()) for c in (plain, told)]
     assert bias[0] < -0.05
     assert abs(bias[1]) < 0.01
     assert (plain.facts["blur_from"], told.facts["blur_from"]) == ("", "calibration")
-    two = Calibrated(blur=0.9, sigma=0.002).scan(
-        Sinusoid(periods=(12, 20), phases=8, radiometry=Radiometry(leakage=0.0))
-    )
+    two = known.scan(Sinusoid(periods=(12, 20), phases=8, radiometry=Radiometry(leakage=0.0)))
     assert two.facts["blur_from"] == "scan"  # what the frames say goes before
-
-
-class Calibrated(Scene):
-    """The same scene on a rig whose blur was measured."""
-
-    def bench(self) -> Bench:
-        return replace(super().bench(), calibration={"optics_blur_px": 0.9})

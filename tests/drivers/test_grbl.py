@@ -16,7 +16,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers import grbl_protocol as grbl
 from drivers.base import (
     Context,
     DeviceError,
@@ -28,7 +27,8 @@ from drivers.base import (
     StageStatus,
 )
 from drivers.clock import NS, Clock, RealClock, ScaledClock
-from drivers.grbl import GrblOptions, GrblStage
+from drivers.grbl import GrblOptions, GrblStage, faults
+from drivers.grbl import protocol as grbl
 from tests.drivers.grbl_peer import GrblPeer, Settings
 
 pytestmark = pytest.mark.timeout(20)
@@ -636,11 +636,11 @@ def test_a_damaged_report_is_none(line: str) -> None:
 
 def test_every_documented_alarm_and_error_has_words_and_a_remedy() -> None:
     for code in range(1, 11):
-        words, remedy = grbl.alarm(code)
+        words, remedy = faults.alarm(code)
         assert f"ALARM:{code}" in words
         assert remedy
     for code in [*range(1, 18), *range(20, 39)]:
-        words, remedy = grbl.refusal(code)
+        words, remedy = faults.refusal(code)
         assert f"error:{code}" in words
         assert "refused" not in words
         assert remedy

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,9 @@ import pytest
 from protocol import messages as m
 from protocol.cli.app import SECTIONS, run
 from protocol.cli.exits import Exit, exit_of
+from protocol.cli.rig import _followed
 from protocol.cli.watch import show_progress
+from protocol.connection import Notice
 from protocol.errors import Code, ErrorInfo, UmbraError
 from protocol.messages import RunState
 from protocol.scans import Checkerboard, Radiometry, Reference, TwoImage
@@ -495,16 +497,57 @@ def test_the_doctor_exits_as_he_found(rig: Rig, capsys: Captured) -> None:
     assert run(["doctor"]) == Exit.FAILED
 
 
-def test_a_log_that_goes_on(rig: Rig, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
-    from protocol.cli import rig as module
+def test_a_log_that_goes_on() -> None:
+    def record(event: str, run: str = "") -> dict[str, str]:
+        return {"event": event, "run": run}
 
-    records = [{"event": "one", "timestamp": "1"}, {"event": "two", "timestamp": "2"}]
-    rounds = iter([records[:1], records[:1], records])
+    def notice(event: str, run: str = "", *, gap: bool = False) -> Notice:
+        body = m.Logged(record=record(event, run))
+        told = m.Event(topic="log", sequence=1, epoch="e", utc="", body=body)
+        return Notice(event=told, arrays={}, gap=gap)
+
+    came = iter([notice("one"), notice("two"), notice("four", gap=True), None, notice("six")])
+    kept = [record("one")]
+
+    class Events:
+        def next(self, timeout_s: float) -> Notice | None:
+            found = next(came)
+            if found is None:
+                kept.append(record("five"))  # said while no event came through
+            elif found.gap:
+                kept.extend(map(record, ("two", "three", "four")))
+            return found
 
     class Client:
-        def log(self, run: str, limit: int) -> tuple[dict[str, str], ...]:
-            return tuple(next(rounds))
+        @contextmanager
+        def subscribe(self, *topics: str) -> Iterator[Events]:
+            assert topics == ("log",)
+            yield Events()
 
-    monkeypatch.setattr(time, "sleep", lambda _: None)
-    followed = module._followed(Client(), "", 50)  # type: ignore[arg-type]
-    assert [next(followed)["event"] for _ in range(2)] == ["one", "two"]
+        def log(self, run: str, limit: int) -> tuple[dict[str, str], ...]:
+            return tuple(kept)
+
+    followed = _followed(Client(), "", 50)  # type: ignore[arg-type]
+    names = ["one", "two", "three", "four", "five", "six"]
+    assert [next(followed)["event"] for _ in names] == names
+
+
+def test_a_runs_log_that_goes_on_is_of_that_run() -> None:
+    came = iter([{"event": "a", "run": "other"}, {"event": "b", "run": "mine"}])
+
+    class Events:
+        def next(self, timeout_s: float) -> Notice:
+            told = m.Event(
+                topic="log", sequence=1, epoch="e", utc="", body=m.Logged(record=next(came))
+            )
+            return Notice(event=told, arrays={}, gap=False)
+
+    class Client:
+        @contextmanager
+        def subscribe(self, *topics: str) -> Iterator[Events]:
+            yield Events()
+
+        def log(self, run: str, limit: int) -> tuple[dict[str, str], ...]:
+            return ()
+
+    assert next(_followed(Client(), "mine", 50))["event"] == "b"  # type: ignore[arg-type]

@@ -24,9 +24,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers import grbl_protocol as grbl
 from drivers.base import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.clock import NS, Clock
+from drivers.grbl import faults
+from drivers.grbl import protocol as grbl
 from drivers.serialport import LineReader, SerialPort
 
 REPEAT_S = 0.25  # a report takes 8 to 20 ms: this one was dropped
@@ -57,6 +58,7 @@ class GrblLink:
         self.was_reset = False  # a banner came that nobody had asked for
         self.refused: tuple[str, int] | None = None  # a streamed line, and its error
         self.banner: grbl.Banner | None = None
+        self.firmware = faults.Firmware.GRBL
         self.report: grbl.Report | None = None  # the last
         self.rx_bytes = 127
         self.scale = 1.0  # mm a reported unit
@@ -64,6 +66,7 @@ class GrblLink:
         self.strange_lines: deque[str] = deque(maxlen=STRANGE_KEPT)
         self.on_report: Callable[[grbl.Report], None] = lambda _report: None
         self.on_lost: Callable[[], None] = lambda: None
+        self.believes: Callable[[grbl.Report], bool] = lambda _report: True
         self._clock = clock
         self._arrived = threading.Event()
         self._interrupted = threading.Event()
@@ -91,6 +94,7 @@ class GrblLink:
         self._reader = LineReader(self.port, self._clock, self._arrived)
         self._awaiting_banner = True
         self.banner = self.report = None
+        self.firmware = faults.Firmware.GRBL
         try:
             deadline = self._after(boot_s)
             while self.banner is None and self.report is None and self._now() < deadline:
@@ -172,7 +176,7 @@ class GrblLink:
     def _send(self, sent: _Sent) -> None:
         self._flight.append(sent)
         self._traffic_ns, self._idle_since_ns = self._now(), None
-        self.port.write(sent.text.encode("ascii") + b"\n")
+        self._write(sent.text.encode("ascii") + b"\n")
 
     def command(self, text: str, timeout_s: float, phase: str) -> list[str]:
         """Send a line and wait for its ok; gives what came before it.
@@ -196,7 +200,7 @@ class GrblLink:
                 "check the cable; the stage has to be connected and homed again",
             )
         if sent.answer.startswith("error:"):
-            problem, remedy = grbl.refusal(int(sent.answer[6:]))
+            problem, remedy = faults.refusal(int(sent.answer[6:]), self.firmware)
             raise DeviceRefused(self.port.device, phase, problem, remedy)
         return sent.replies
 
@@ -206,7 +210,14 @@ class GrblLink:
             self._last_ask_ns = self._now()
             if self._first_ask_ns is None:
                 self._first_ask_ns = self._last_ask_ns
-        self.port.write(byte)
+        self._write(byte)
+
+    def _write(self, data: bytes) -> None:
+        try:
+            self.port.write(data)
+        except DeviceLost:
+            self.on_lost()
+            raise
 
     def urge(self, byte: bytes) -> None:
         """From any thread: a real-time byte, and an end to the wait under way. Never raises."""
@@ -245,7 +256,7 @@ class GrblLink:
             report = self.report
             if report is not None and self._fresh(began):
                 return report
-            if self.alarm in {1, 2} or self.was_reset:
+            if faults.is_critical(self.alarm, self.firmware) or self.was_reset:
                 break  # it answers nothing until it is reset; the caller looks
         raise DeviceTimeout(
             self.port.device,
@@ -321,6 +332,9 @@ class GrblLink:
             ) from reader.error
 
     def _digest(self, at_ns: int, line: str) -> None:
+        line = grbl.plain(line)
+        if not line:
+            return
         if line == "ok" or line.startswith("error:"):
             self._acknowledge(line)
         elif line.startswith("<"):
@@ -359,7 +373,7 @@ class GrblLink:
             at_ns=at_ns,
             asked_ns=asked if asked is not None else at_ns,
         )
-        if report is None:
+        if report is None or not self.believes(report):
             self._wonder(line)
             return
         self.report = report
@@ -377,6 +391,8 @@ class GrblLink:
             self.was_reset = True
         self._awaiting_banner = False
         self.banner = banner
+        if banner.name is not faults.Firmware.GRBL:  # a compatible one may call itself Grbl
+            self.firmware = banner.name
         self._flight.clear()  # its buffers are empty now, whatever was in them
         self._first_ask_ns = None
         self._idle_since_ns, self._quiet_reports = None, 0
