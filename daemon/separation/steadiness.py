@@ -94,6 +94,11 @@ def leaks(references: References, leakage: float) -> list[str]:
         return []
     black, white = _calm(dark)[good], _calm(lit)[good]
     low, middle, high = (float(q) for q in np.quantile(black / white, [0.25, 0.5, 0.75]))
+    if middle < -_OVER:
+        return [
+            f"black frames are below black, by {-middle:.3f} of the light of white ones: the black "
+            "level that was given is too high (--black, `umbra calibrate dark`)"
+        ]
     if leakage > middle + _OVER:
         return [
             f"the leakage {leakage:g} cannot be: black frames have {middle:.3f} of the light of "

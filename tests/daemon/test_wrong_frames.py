@@ -268,6 +268,13 @@ def test_too_large_a_leakage_is_told_with_references(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
+def test_too_high_a_black_level_is_told_and_harmless_with_references(name: str) -> None:
+    found = _judged(name, BLACK_WHITE, radiometry=Radiometry(leakage=0.02, black=6000.0))
+    assert _says(found, "black level that was given is too high")
+    assert _error(found) == pytest.approx(_error(_judged(name, BLACK_WHITE)), abs=0.002)
+
+
+@pytest.mark.parametrize("name", ALL)
 @references_or_not
 @pytest.mark.parametrize("ambient", [0.0, 0.02])
 def test_a_projector_of_gamma_2_2_is_told_or_makes_no_difference(
