@@ -22,8 +22,10 @@ Mask = NDArray[np.bool_]
 _PERIOD = 64.0
 """Projector pixels of the wave that a coordinate is made into; finer than this lies no mirror."""
 
-_TORN = 0.25  # of neighbours: so many are far from each other where frames are in a wrong order
+_TORN = 0.15  # of neighbours: so many are far from each other where frames are in a wrong order
 _FAR = 24.0  # projector pixels
+_LAGS = (8, 32)  # pixels to farther ones
+_CLEAR = 2.0  # projector pixels
 _ACROSS = 3.0  # times the change along an axis: the other one's coordinate
 _ENOUGH = 400
 
@@ -50,25 +52,19 @@ def mirrored_coordinates(
     advice: list[str] = []
     facts: dict[str, Any] = {}
     for name, plane in planes.items():
-        torn, along, across = _steps(plane, 1 if name == "column" else 0)
+        torn = _torn(plane, 1 if name == "column" else 0)
         if torn is None:
             continue
         facts[f"{name}_torn"] = round(torn, 4)
         if torn > _TORN:
             advice.append(
-                f"the decoded {name}s of {torn:.0%} of the neighbouring pixels are far from each "
-                "other: the frames are not a Gray code's in the declared order, each bit's pattern "
-                "then its inverse, the coarsest first (--bits, --axes), or some are missing; "
-                f"direct light may be a coarse stripe's and the {name} is not to be trusted"
+                f"the decoded {name}s of {torn:.0%} of the neighbouring pixels jump or run back: "
+                "the frames are not a Gray code's in the declared order, each bit's pattern then "
+                "its inverse, the coarsest first (--bits, --axes), or some are missing: the "
+                f"{name}s are not to be trusted, and direct light may be a coarse stripe's"
             )
-        elif across > _ACROSS * along:
-            other = "row" if name == "column" else "column"
-            advice.append(
-                f"the decoded {name}s change {across / max(along, 1e-6):.0f} times faster along "
-                f"the picture's {'columns' if name == 'column' else 'rows'} than along its "
-                f"{'rows' if name == 'column' else 'columns'}: if the camera is not turned on its "
-                f"side, the stripes were those of the other axis (--axes), and it is the {other}"
-            )
+    if not advice:
+        advice = other_axis(planes)
     if advice and any(value > _TORN for value in facts.values()):
         return Told(np.zeros(known.shape, np.bool_), {**facts, "mirrors_looked_for": False}, advice)
     waves = [_wave(plane, known) for plane in planes.values()]
@@ -89,13 +85,47 @@ def _wave(plane: Plane, known: Mask) -> Wave:
     return np.asarray(np.where(known, np.exp(1j * turn), 0.0), dtype=np.complex64)
 
 
-def _steps(plane: Plane, axis: int) -> tuple[float | None, float, float]:
-    """The part of neighbours that are far from each other, and the mean change along the picture's
-    `axis` and along the other; None where too few are known."""
-    found = [np.abs(np.diff(plane, axis=a)) for a in (axis, 1 - axis)]
-    steps = [step[np.isfinite(step)] for step in found]
-    if min(step.size for step in steps) < _ENOUGH:
-        return None, 0.0, 0.0
-    torn = max(float(np.mean(step > _FAR)) for step in steps)
-    along, across = (float(np.mean(np.minimum(step, _FAR))) for step in steps)
-    return torn, along, across
+def other_axis(planes: Mapping[str, Plane]) -> list[str]:
+    """A line for each coordinate that changes along the other axis of the picture."""
+    lines = []
+    for name, plane in planes.items():
+        axis = 1 if name == "column" else 0
+        along, across = (_change(plane, a) for a in (axis, 1 - axis))
+        if along is None or across is None or across <= _ACROSS * along:
+            continue
+        other = "row" if name == "column" else "column"
+        lines.append(
+            f"the decoded {name}s change along the picture's {name}s, not from one to the next: if "
+            "the camera is not turned on its side, the stripes were those of the other axis "
+            f"(--axes, --axis), and each is a {other}"
+        )
+    return lines
+
+
+def _change(plane: Plane, axis: int) -> float | None:
+    """The mean change from a pixel to the next along an axis; None where too few are known."""
+    step = np.abs(np.diff(plane, axis=axis))
+    step = step[np.isfinite(step)]
+    return None if step.size < _ENOUGH else float(np.mean(np.minimum(step, _FAR)))
+
+
+def _torn(plane: Plane, axis: int) -> float | None:
+    """The part of the pixels that are far from their neighbours, or of those on the way to a
+    farther one where the coordinate runs back; None where too few are known."""
+    parts = []
+    for a in (0, 1):
+        step = np.abs(np.diff(plane, axis=a))
+        step = step[np.isfinite(step)]
+        if step.size < _ENOUGH:
+            return None
+        parts.append(float(np.mean(step > _FAR)))
+    for lag in _LAGS:
+        here: list[slice] = [slice(None), slice(None)]
+        there: list[slice] = [slice(None), slice(None)]
+        here[axis], there[axis] = slice(None, -lag), slice(lag, None)
+        step = plane[tuple(there)] - plane[tuple(here)]
+        step = step[np.isfinite(step) & (np.abs(step) > _CLEAR)]
+        if step.size >= _ENOUGH:
+            forward = float(np.mean(step > 0))
+            parts.append(min(forward, 1.0 - forward))
+    return max(parts)

@@ -21,6 +21,7 @@ from daemon.separation.radiometry import Plane, Response
 
 _SAMPLES = 20_000
 _ODD = 0.2  # of the usual light: a frame of few so far from it is none of the set
+_ODD_PAIR = 0.08  # of two, whose usual light is in the middle
 _ODD_AT_LEAST = 0.05  # where many frames say how much it differs from pattern to pattern ...
 _ODD_SPREADS = 8.0  # ... by so many deviations
 _MANY = 6  # frames
@@ -29,6 +30,14 @@ _STEP_ERRORS = 5.0
 _UNEQUAL = 0.05  # of a pair's light, from pair to pair
 _SAME = 0.35  # of the usual difference of two frames in a row: below it they are one pattern
 _MOST_NAMED = 5
+
+
+UNCHECKED = (
+    "no black, white or ambient frame came with the patterns: light of the room counts as global, "
+    "and black level, leakage and tone curve are taken as given, for little is there to check them "
+    "by (of photographs: --black-frame, --white-frame; of a scan: --references)"
+)
+"""Advice where patterns are all that there is."""
 
 
 class FrameSet:
@@ -72,9 +81,10 @@ class FrameSet:
         if first != pattern:
             self._copies.append((first, pattern))
 
-    def told(self) -> tuple[dict[str, Any], list[str]]:
-        """Facts and lines of advice."""
+    def told(self) -> tuple[dict[str, Any], list[str], list[str]]:
+        """Facts, lines of advice, and what is to be said after all other advice."""
         lines = [*self._copied(), *self._swapped()]
+        last = [] if self._references else [UNCHECKED]
         facts: dict[str, Any] = {}
         if self._even and len(self._levels) >= 2:
             order = sorted(self._levels)
@@ -87,7 +97,7 @@ class FrameSet:
                     "highest": round(float(off.max()), 4),
                 }
                 lines += _odd(order, off) or _stepped(order, off)
-        return facts, lines
+        return facts, lines, last
 
     def _copied(self) -> list[str]:
         if not self._distinct:
@@ -141,7 +151,7 @@ class FrameSet:
 
 def _odd(order: list[int], off: NDArray[np.float64]) -> list[str]:
     """Frames whose light is far from the others'."""
-    limit = _ODD
+    limit = _ODD_PAIR if len(order) == 2 else _ODD
     if len(order) >= _MANY:
         spread = 1.4826 * float(np.median(np.abs(off)))
         limit = min(_ODD, max(_ODD_AT_LEAST, _ODD_SPREADS * spread))
@@ -156,9 +166,9 @@ def _odd(order: list[int], off: NDArray[np.float64]) -> list[str]:
         ]
     named = ", ".join(f"{n + 1} ({1 + by:.2f})" for n, by in odd[:_MOST_NAMED])
     return [
-        f"{len(odd)} of {len(order)} frames have another light as a whole than the rest, beginning "
-        f"with pattern {named}: a frame that is black, white or of something else, or a source "
-        "that flickers; take it out or scan again, for an extreme takes it for light or shadow"
+        f"of {len(order)} patterns' frames {len(odd)} stand out by their light as a whole: pattern "
+        f"{named} of the usual light; such a frame is black, white or of something else, or the "
+        "source flickers: see to it and scan again, for it is taken for light or shadow"
     ]
 
 
@@ -201,8 +211,8 @@ class Watched:
         result = self._inner.result()
         if not isinstance(result, Components):
             return result
-        facts, lines = self._frames.told()
-        advice = [*lines, *result.facts.get("advice", ())]
+        facts, lines, last = self._frames.told()
+        advice = [*lines, *result.facts.get("advice", ()), *last]
         return replace(result, facts={**result.facts, **facts, "advice": advice})
 
     def summary(self) -> dict[str, float]:
@@ -217,6 +227,7 @@ class PairSums:
         self._sum: NDArray[np.float64] | None = None
         self._squares: NDArray[np.float64] | None = None
         self._pairs = 0
+        self._levels: list[float] = []
 
     def add(self, whole: Plane) -> None:
         """Take in the sum of a pair's two pictures."""
@@ -224,6 +235,7 @@ class PairSums:
         values = whole[::step, ::step].astype(np.float64)
         if self._sum is None or self._squares is None:
             self._sum, self._squares = np.zeros_like(values), np.zeros_like(values)
+        self._levels.append(float(values.mean()))
         self._sum += values
         self._squares += np.square(values)
         self._pairs += 1
@@ -235,13 +247,16 @@ class PairSums:
         mean = self._sum / self._pairs
         spread = np.sqrt(np.maximum(self._squares / self._pairs - np.square(mean), 0.0))
         bright = mean > np.median(mean)
-        part = float(np.median(spread[bright] / np.maximum(mean[bright], 1e-6)))
+        # a frame that is wrong may leave half of the pixels as they are
+        part = float(np.quantile(spread[bright] / np.maximum(mean[bright], 1e-6), 0.75))
         noise = float(np.sqrt(2.0)) * deviation / max(float(np.median(mean[bright])), 1e-6)
         facts = {"pair_spread": round(part, 4)}
-        if part < max(_UNEQUAL, 3.0 * noise):
+        levels = np.asarray(self._levels)
+        off = float(np.max(np.abs(levels / max(float(np.median(levels)), 1e-6) - 1.0)))
+        if off < _UNEQUAL and part < max(_UNEQUAL, 3.0 * noise):
             return facts, []
         return facts, [
-            f"a pattern and the one after it add up to light that differs by {part:.0%} from pair "
-            "to pair, not to the same: the frames are not a Gray code's patterns, each followed by "
-            "its inverse, the coarsest bit first (--bits, --axes), or the light changed"
+            f"a pattern and the one after it add up to light that differs by {max(part, off):.0%} "
+            "from pair to pair, not to the same: the frames are not a Gray code's patterns, each "
+            "followed by its inverse, the coarsest bit first (--bits, --axes), or the light changed"
         ]

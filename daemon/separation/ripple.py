@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 Plane = NDArray[np.float32]
 
 _HARMONICS = 3
+_COLLAPSED = 0.8  # of one: what phases add up to that are all alike
 _ENOUGH = 400  # pixels
 
 
@@ -34,6 +35,9 @@ def ripple(mean: Plane, wave: NDArray[np.complex64], strong: NDArray[np.bool_]) 
         basis += [np.cos(harmonic * turn), np.sin(harmonic * turn)]
     design = np.stack(basis)
     normal = design @ design.T
+    once, twice = (abs(np.mean(np.exp(1j * n * turn))) for n in (1, 2))
+    if twice > _COLLAPSED and once < _COLLAPSED:
+        return 1.0  # two opposite phases alone: two of the frames are one
     if np.linalg.cond(normal) > 1e3:  # the phases do not go round
         return None
     sizes = []

@@ -16,7 +16,10 @@ from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.noise import from_frame
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
+from daemon.separation.steadiness import leaks
 
+_ASTRAY = 1.5  # times the change across stripes: along them there is no more
+_OFF = 0.1  # of the light: peaks and valleys are off by less for blur and noise
 _HALF = 0.1  # lit fractions so near to a half have their middle at ½(W + K)
 _PEAK = 0.82 * 0.9
 """Deviation of a row's peaks in a square over a pixel's: a peak is the larger of two pixels as
@@ -110,6 +113,7 @@ class PeaksAndValleys:
         deviation = self._deviation(picture, brightest)
         planes = self._stated(deviation, self._deviation(picture, darkest))
         mirrored = self._mirrored(picture)
+        told = self._told(picture, brightest, darkest)
         plain = replace(self._response, bayer="")
         return finish(
             direct,
@@ -129,6 +133,7 @@ class PeaksAndValleys:
                 "reduced_by": self._reduce,
                 "noise_from": "one picture",
                 "mirrors_looked_for": mirrored is not None,
+                **told,
                 **self._references.facts(source),
             },
         )
@@ -136,6 +141,37 @@ class PeaksAndValleys:
     def summary(self) -> dict[str, float]:
         """Images separated, and frames not used."""
         return {"images": float(self._images), "unused": float(self._unused)}
+
+    def _told(self, picture: Plane, lit: Plane, unlit: Plane) -> dict[str, Any]:
+        """Whether the picture can be that of the stripes, and of the scene of black and white."""
+        lines = []
+        step = 2 if self._response.bayer else 1  # to the next sample of a colour
+        along, across = (
+            float(np.mean(np.abs(np.diff(picture[::step, ::step], axis=axis)), dtype=np.float64))
+            for axis in ((0, 1) if self._across == "x" else (1, 0))
+        )
+        if along > _ASTRAY * across:
+            other = "y" if self._across == "x" else "x"
+            lines.append(
+                f"light changes {along / max(across, 1e-6):.1f} times more along the stripes than "
+                f"across them: they are those of the other axis (--axis {other})"
+            )
+        facts: dict[str, Any] = {"change_along": round(along / max(across, 1e-6), 4)}
+        black = self._references.mean(Lighting.BLACK)
+        white = self._references.mean(Lighting.WHITE)
+        if black is not None and white is not None and abs(self._alpha - 0.5) < _HALF:
+            expected = self._reduced(white + black)
+            ratio = float(np.median((lit + unlit) / np.maximum(expected, np.float32(1e-3))))
+            facts["mean_ratio"] = round(ratio, 4)
+            if abs(ratio - 1.0) > _OFF:
+                lines.append(
+                    f"peaks and valleys have {ratio:.2f} of the light of white and black, not 1: "
+                    "the camera's tone curve is not the one given (--tone), or light or scene "
+                    "changed since the black and white frames"
+                )
+            else:
+                lines += leaks(self._references, self._leakage)
+        return {**facts, "advice": lines}
 
     def _mirrored(self, picture: Plane) -> NDArray[np.bool_] | None:
         """Where the stripes run astray, at the lower resolution; None without black and white

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from daemon.separation import correspondence
 from daemon.separation.blur import of_wave
+from daemon.separation.coordinates import other_axis
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import STRONG, strength
@@ -149,7 +150,11 @@ class LeastSquares:
             **steady,
             "misfit": None if misfit is None else round(misfit, 3),
             "ripple": None if rippled is None else round(rippled, 4),
-            "advice": _advice(misfit, self._noise.distortion, disagreeing, rippled) + advice,
+            "advice": [
+                *_advice(misfit, self._noise.distortion, disagreeing, rippled),
+                *other_axis({n: planes[n] for n in ("column", "row") if n in planes}),
+                *advice,
+            ],
         }
         return finish(
             direct,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,6 +33,8 @@ LIVE = {
     *("auto_exposure", "deadline_s", "light_min", "light_max", "steady", "look_s"),
 }
 """Fields that are no options here: the photographs have them, or the files given say them."""
+TYPED = {"path": "DIR", "match": "--match", "bayer": "--bayer"}
+"""What is typed for the keys of the recording's driver."""
 OPTIONS = union_options(METHODS, without=LIVE)
 
 
@@ -140,11 +143,17 @@ def _each_exposure(first: Mapping[Reference, list[Path]], exposures: tuple[float
             raise UmbraError(Code.BAD_REQUEST, f"{wanted}: {len(files)} files were given")
 
 
+def as_typed(message: str) -> str:
+    """A message of the recording's driver with its keys as they were given: options, or DIR."""
+    return re.sub(r"`(\w+)`", lambda key: TYPED.get(key[1], key[0]), message)
+
+
 def usable(client: Client) -> None:
     """Raise UmbraError(bad_input) with the camera's own words if it cannot read its recording."""
     for device in client.devices():
         if device.health is not Health.READY:
-            raise UmbraError(Code.BAD_INPUT, device.message.removeprefix("camera: connect: "))
+            said = device.message.removeprefix("camera: connect: ")
+            raise UmbraError(Code.BAD_INPUT, as_typed(said))
 
 
 def report(info: RunInfo, files: Iterable[Path], facts: Mapping[str, Any], as_json: bool) -> None:
