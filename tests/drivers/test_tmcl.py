@@ -167,7 +167,7 @@ def test_circles_begin_at_angle_0_and_are_followed(peer: TmclPeer, reverse: bool
     stage.connect()
     stage.home(5.0)
     stage.circle((10.0, 5.0), R, 40.0, 1.25)
-    positions = []
+    positions: list[tuple[float, float] | None] = []
 
     def follow(status: StageStatus) -> bool:
         positions.extend(stage.position_at(status.at_ns - ms * 10**6) for ms in (2, 20, 50, 80))
