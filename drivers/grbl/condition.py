@@ -1,8 +1,8 @@
 """What is known of the stage: alarms, resets behind its back, where it is and whether it moves.
 
-Everything that comes unasked is drawn its consequence from here, at the beginning of each call and
-after each answer: an alarm, a reset, a lost acknowledgement and a lost line make the position
-unknown, and nothing moves before it was homed again.
+What comes unasked has its consequences here, at the beginning of each call and after each answer:
+an alarm, a reset, a lost acknowledgement and a lost line make the position unknown, and nothing
+moves before it was homed again.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ class Condition:
         self.track = Track()
         self._believed: Report | None = None
         self._doubted: Report | None = None
+        self._last_position: Point | None = None
         self._still_since_ns: int | None = None
         link.on_report = self._on_report
         link.on_lost = self.lost
@@ -234,8 +235,6 @@ class Condition:
             self._still_since_ns = None
         elif self._still_since_ns is None:
             self._still_since_ns = report.at_ns
-
-    _last_position: Point | None = None
 
 
 def no_machine_position(device: str, phase: str) -> DeviceRefused:

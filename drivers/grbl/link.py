@@ -32,6 +32,7 @@ from drivers.serialport import LineReader, SerialPort
 
 REPEAT_S = 0.25  # a report takes 8 to 20 ms: this one was dropped
 QUERY_S = 1.2  # Grbl is silent for .5 s after an alarm
+STILL_SILENT_S = 0.6  # asked again after a silence: a safe state is not to wait for long
 REPLY_S = 2.0  # $$ takes .2 s at 115200 baud
 BANNER_S = 1.5  # from a soft reset, the .5 s after an alarm included
 LOST_ACK_S = 1.0  # idle for this long with lines unacknowledged
@@ -78,6 +79,7 @@ class GrblLink:
         self._traffic_ns = 0  # the last line sent or acknowledged
         self._idle_since_ns: int | None = None
         self._quiet_reports = 0
+        self._silent = False  # a query was not answered, and nothing came since
 
     # ------------------------------------------------------------ opening
 
@@ -121,6 +123,7 @@ class GrblLink:
         self.refused = None
         self._first_ask_ns = None
         self._idle_since_ns, self._quiet_reports = None, 0
+        self._silent = False
 
     def reset(self, phase: str) -> None:
         """Soft reset: everything in flight is gone. Returns after the banner. DeviceTimeout."""
@@ -248,7 +251,8 @@ class GrblLink:
     def ask(self, phase: str) -> grbl.Report:
         """A fresh report. Asks again when one was dropped; DeviceTimeout, DeviceLost."""
         began = self._now()
-        deadline = began + round(QUERY_S * NS)
+        allowed_s = STILL_SILENT_S if self._silent else QUERY_S
+        deadline = began + round(allowed_s * NS)
         self._first_ask_ns = None
         while self._now() < deadline:
             self.realtime(grbl.STATUS)
@@ -258,10 +262,14 @@ class GrblLink:
                 return report
             if faults.is_critical(self.alarm, self.firmware) or self.was_reset:
                 break  # it answers nothing until it is reset; the caller looks
-        raise DeviceTimeout(
+        raise self._silence(phase, allowed_s)
+
+    def _silence(self, phase: str, seconds: float) -> DeviceTimeout:
+        self._silent = True
+        return DeviceTimeout(
             self.port.device,
             phase,
-            f"no status report within {QUERY_S} s",
+            f"no status report within {seconds} s",
             "check the cable and the controller's power",
         )
 
@@ -279,12 +287,7 @@ class GrblLink:
                 self.realtime(grbl.STATUS)
         elif now - self._first_ask_ns > QUERY_S * NS:
             self._first_ask_ns = None
-            raise DeviceTimeout(
-                self.port.device,
-                "poll",
-                f"no status report within {QUERY_S} s",
-                "check the cable and the controller's power",
-            )
+            raise self._silence("poll", QUERY_S)
         elif now - self._last_ask_ns > REPEAT_S * NS:
             self.realtime(grbl.STATUS)
 
@@ -332,6 +335,7 @@ class GrblLink:
             ) from reader.error
 
     def _digest(self, at_ns: int, line: str) -> None:
+        self._silent = False
         line = grbl.plain(line)
         if not line:
             return

@@ -20,7 +20,7 @@ import threading
 import time
 import tty
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -58,6 +58,8 @@ class Faults:
     switch_missing: bool = False  # homing finds no switch: ALARM:9
     homing_s: float = 0.1
     hard_limit_at: float | None = None  # x below which a limit switch closes: ALARM:1
+    stalled: bool = False  # it says Run, and does not move
+    spoil: Callable[[bytes], bytes] | None = None  # what the line makes of what it says
     refuse: dict[str, int] = field(default_factory=dict)  # part of a line -> error code
 
 
@@ -197,6 +199,8 @@ class GrblPeer:
         self._put(text.encode() + b"\r\n")
 
     def _put(self, data: bytes) -> None:
+        if self.faults.spoil is not None:
+            data = self.faults.spoil(data)
         if self._master >= 0 and not self.faults.mute:
             with contextlib.suppress(OSError):
                 os.write(self._master, data)
@@ -359,11 +363,11 @@ class GrblPeer:
             self._identify()
             self._ok()
         elif line.startswith("$/"):
-            value = self._items().get(line[2:])
-            if value is None:
+            item = self._items().get(line[2:])
+            if item is None:
                 self._say("error:3")
                 return
-            self._say(f"{line}={value}")
+            self._say(f"{line}={item}")
             self._ok()
         elif line == "$$":
             values = {
@@ -514,6 +518,8 @@ class GrblPeer:
         if self.state == "Idle" and self._blocks and self._running is None and not self._rx:
             self.state = "Run"  # auto-start when no more lines come
         if self.state not in {"Run", "Jog", "Hold"} or self._critical:
+            return
+        if self.faults.stalled and not self._holding:
             return
         a = self.settings.acceleration
         left = self._left()

@@ -492,6 +492,9 @@ def test_stage_moves_are_asked_for_as_they_are_typed(rig: Rig, capsys: Captured)
     assert run(["stage", "move", "10", "12"]) == Exit.OK
     assert asked(rig, m.StageMove).feed_mm_s == 10.0  # half of the fastest
     assert "1.000, 2.000 mm" in capsys.readouterr().out
+    assert run(["stage", "move", "-10.5", "-12", "--feed", "4"]) == Exit.OK  # no option
+    there = asked(rig, m.StageMove)
+    assert (there.x_mm, there.y_mm) == (-10.5, -12.0)
     assert run(["stage", "home", "--timeout", "7"]) == Exit.OK
     assert asked(rig, m.StageHome).timeout_s == 7.0
     assert run(["stage", "circle", "1", "2", "3", "--wait"]) == Exit.USAGE  # it has no end
