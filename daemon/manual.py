@@ -249,12 +249,19 @@ class Manual:
         def take(cam: Camera) -> tuple[Frame, CameraInfo]:
             info = cam.info()
             out = np.zeros(info.shape, info.pixel_format.dtype)
+            exposure_s = (cam.settings().exposure_us or 0.0) * 1e-6
+            patience_s = exposure_s + info.readout_s + _FRAME_S
+            triggered = "software" in info.triggers
             cam.stop()  # a live view may have left it acquiring
-            cam.start(Acquisition.SOFTWARE)
+            cam.start(Acquisition.SOFTWARE if triggered else Acquisition.FREE)
             try:
-                cam.trigger()
-                exposure_s = (cam.settings().exposure_us or 0.0) * 1e-6
-                return cam.grab(out, exposure_s + info.readout_s + _FRAME_S), info
+                asked_ns = self._rig.clock.now_ns()
+                if triggered:
+                    cam.trigger()
+                frame = cam.grab(out, patience_s)
+                while not triggered and not info.recorded and frame.start_ns < asked_ns:
+                    frame = cam.grab(out, patience_s)
+                return frame, info
             finally:
                 cam.stop()
 
