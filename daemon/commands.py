@@ -356,7 +356,8 @@ class Commands:
 def _looked(glimpse: Glimpse, width: int) -> Answer:
     small = picture.narrowed(glimpse.picture, width)
     arrays = {"preview": small, "saturated": cells(glimpse.saturated, *small.shape[:2])}
-    return Answer(m.Picture(facts={**glimpse.facts, "run": glimpse.run}), arrays)
+    age_s = round(time.monotonic() - glimpse.at_s, 1)
+    return Answer(m.Picture(facts={**glimpse.facts, "run": glimpse.run, "age_s": age_s}), arrays)
 
 
 def _about(run: RunFolder) -> Answer:

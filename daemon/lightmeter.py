@@ -114,7 +114,7 @@ class LightMeter:
         """Tried again where none came, or half of one: a picture has no effect."""
         for attempt in range(1, self._attempts + 1):
             try:
-                frame, info = snap(self._rig.camera, self._session, settings)
+                frame, info = snap(self._rig.camera, self._session, self._rig.clock, settings)
             except Stuck:
                 raise
             except (DeviceTimeout, DeviceGarbled) as error:

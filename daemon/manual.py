@@ -252,7 +252,7 @@ class Manual:
 
         try:
             with self._noticed(), self.live.aside():
-                frame, info = snap(camera, session)
+                frame, info = snap(camera, session, self._rig.clock)
         finally:
             if not was_active:
                 self.end()
@@ -268,7 +268,9 @@ class Manual:
         session = self.use(_EXPOSE_S)
 
         def look(exposure_us: float) -> Level:
-            frame, info = snap(camera, session, replace(wanted, exposure_us=exposure_us))
+            frame, info = snap(
+                camera, session, self._rig.clock, replace(wanted, exposure_us=exposure_us)
+            )
             self._viewfinder.offer(frame, info, now=True)
             return level_of(frame.pixels, response, frame.exposure_us or exposure_us)
 

@@ -320,8 +320,12 @@ def calibration(file: RunFile) -> str:
 def calibration_advice(file: RunFile) -> list[str]:
     """A line for each calibration that could not be applied."""
     return [
-        f"The {one['kind']} calibration {one['run']} was not applied: {one['why']}; "
-        f"run `umbra calibrate {one['kind']}`."
+        (
+            f"The {one['kind']} calibration {one['run']} was not applied: {one['why']}"
+            if one["run"]
+            else f"The {one['kind']} was {one['why']}"
+        )
+        + f"; run `umbra calibrate {one['kind']}`."
         for one in (file.calibration or {}).get("ignored", ())
     ]
 

@@ -1,4 +1,4 @@
-"""One picture, by software trigger, outside of any scan."""
+"""One picture outside of any scan: by a software trigger, else of a camera that runs free."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from drivers.base import (
     DeviceLost,
     Frame,
 )
+from drivers.clock import Clock
 
 _PATIENCE_S = 2.0
 """Beyond exposure and readout, until a frame is called lost."""
@@ -22,7 +23,10 @@ _CALL_S = 10.0
 
 
 def snap(
-    camera: DeviceThread[Camera], session: Session, wanted: CameraSettings | None = None
+    camera: DeviceThread[Camera],
+    session: Session,
+    clock: Clock,
+    wanted: CameraSettings | None = None,
 ) -> tuple[Frame, CameraInfo]:
     """Take one picture, with these settings if any are given; in memory of its own.
 
@@ -36,10 +40,16 @@ def snap(
         info = device.info()
         out = np.zeros(info.shape, info.pixel_format.dtype)
         exposure_s = (device.settings().exposure_us or 0.0) * 1e-6
-        device.start(Acquisition.SOFTWARE)
+        patience_s = exposure_s + info.readout_s + _PATIENCE_S
+        triggered = "software" in info.triggers
+        device.start(Acquisition.SOFTWARE if triggered else Acquisition.FREE)
         try:
-            device.trigger()
-            frame = device.grab(out, exposure_s + info.readout_s + _PATIENCE_S)
+            asked_ns = clock.now_ns()
+            if triggered:
+                device.trigger()
+            frame = device.grab(out, patience_s)
+            while not triggered and not info.recorded and frame.start_ns < asked_ns:
+                frame = device.grab(out, patience_s)  # the first came from a buffer's past
         except DeviceLost:
             raise  # there is nothing to stop
         except DeviceError:

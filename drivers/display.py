@@ -33,6 +33,7 @@ from drivers.base import (
     Projector,
     ProjectorInfo,
 )
+from drivers.clock import NS
 from drivers.displaywindow import Call, DisplayOptions, DisplayWindow, Reply
 
 PROGRAM = "from drivers.displaywindow import main; main()"
@@ -45,9 +46,9 @@ UNKNOWN = ProjectorInfo(0, 0, 0.0)
 class DisplayProjector(Projector):
     """See the module. `show` also takes (H, W, 3) RGB, for drivers that send bit planes.
 
-    The moment that `show` gives is the flip's plus `latency_frames` refreshes: measure those
-    (docs/hardware.md). The safe state is black, the lamp stays on; `safe` returns when it is
-    black by the same reckoning.
+    The moment that `show` gives is the flip's plus `latency_frames` refreshes, where they are told.
+    The safe state is black, the lamp stays on; `safe` returns when it is black by the same
+    reckoning, or, where nothing was told, after what slow projectors need.
     """
 
     options_type = DisplayOptions
@@ -104,7 +105,9 @@ class DisplayProjector(Projector):
         """See Device: black. A halt ends the wait for the light, not the flip."""
         self._halted.clear()
         black = np.zeros((self._info.height, self._info.width), np.uint8)
-        self.clock.wait_until(self._show(black, "safe"), self._halted)
+        dark_ns = self._show(black, "safe")
+        dark_ns += round(self._facts.get("assumed_latency_s", 0.0) * NS)
+        self.clock.wait_until(dark_ns, self._halted)
 
     def halt(self) -> None:
         """See Device. No flip blocks for longer than a refresh."""

@@ -51,6 +51,7 @@ HINTS = {
     "SDL_VIDEO_MINIMIZE_ON_FOCUS_LOSS": "0",  # a click on another screen must not take it down
     "SDL_VIDEO_ALLOW_SCREENSAVER": "0",
 }
+ASSUMED_FRAMES = 6.0  # what slow projectors need
 MEASURED = 24  # flips, to learn the refresh rate
 FASTEST_HZ = 500.0  # flips that come faster do not wait for the refresh
 DRIFT = 0.1  # by which the measured rate may differ from the one in rig.toml
@@ -67,7 +68,9 @@ class DisplayOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
     output: int | str = 0  # its number, or its name as `umbra devices --scan` prints it
     size: tuple[int, int] | None = None  # width, height that the output must have
     refresh_hz: Annotated[float, Meta(gt=0)] | None = None  # None: as measured at connect
-    latency_frames: Annotated[float, Meta(ge=0)] = 6.0  # from the flip to this image's light
+    #: from the flip to this image's light; None: nobody knows, and scans wait for ASSUMED_FRAMES
+    #: until it has been calibrated
+    latency_frames: Annotated[float, Meta(ge=0)] | None = None
     channel: Literal["white", "red", "green", "blue"] = "white"
     video_driver: str = ""  # SDL's name: kmsdrm, x11, wayland; "": SDL chooses
     windowed: bool = False  # in a window of `size`, paced by the clock: to try out, no more
@@ -174,6 +177,8 @@ class DisplayWindow(Projector):
             "flips_by": "timer" if slow or self._o.windowed else "output",
             "channel": self._o.channel,
         }
+        if self._o.latency_frames is None:
+            self._facts["assumed_latency_s"] = round(ASSUMED_FRAMES / self._refresh_hz, 6)
         return Identity(f"display {name} {size[0]}x{size[1]}", "", f"SDL {self._facts['sdl']}")
 
     def _find(self, names: list[str]) -> int:
@@ -248,7 +253,9 @@ class DisplayWindow(Projector):
     def safe(self) -> None:
         """See Device: black. A halt ends the wait for the light, not the flip."""
         self._halted.clear()
-        self.clock.wait_until(self.show(np.zeros(self._size[::-1], np.uint8)), self._halted)
+        dark_ns = self.show(np.zeros(self._size[::-1], np.uint8))
+        dark_ns += round(self._facts.get("assumed_latency_s", 0.0) * NS)
+        self.clock.wait_until(dark_ns, self._halted)
 
     def halt(self) -> None:
         """See Device. No flip blocks for longer than a refresh."""
@@ -266,7 +273,8 @@ class DisplayWindow(Projector):
     def info(self) -> ProjectorInfo:
         """See Projector."""
         width, height = self._size
-        latency = self._o.latency_frames / self._refresh_hz if self._refresh_hz else 0.0
+        frames = self._o.latency_frames or 0.0
+        latency = frames / self._refresh_hz if self._refresh_hz else 0.0
         return ProjectorInfo(width, height, self._refresh_hz, latency)
 
     def facts(self) -> dict[str, Any]:
@@ -284,7 +292,7 @@ class DisplayWindow(Projector):
                 "draw it for the size in info()",
             )
         self._draw(image)
-        return self._flip() + round(self._o.latency_frames * NS / self._refresh_hz)
+        return self._flip() + round((self._o.latency_frames or 0.0) * NS / self._refresh_hz)
 
     def _draw(self, image: NDArray[np.uint8]) -> None:
         assert self._surface is not None

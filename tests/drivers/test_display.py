@@ -61,6 +61,7 @@ def test_pictures_reach_the_screen_through_its_process(
         assert (info.width, info.height) == (WIDTH, HEIGHT)
         assert info.latency_s == pytest.approx(2 / info.refresh_hz)
         assert projector.facts()["video_driver"] == "x11"
+        assert "assumed_latency_s" not in projector.facts()
         for image in (noise(HEIGHT, WIDTH), noise(WIDTH, HEIGHT).T, noise(HEIGHT, WIDTH, 3)):
             before = projector.clock.now_ns()
             lit = projector.show(image) - round(info.latency_s * 1e9)
@@ -96,6 +97,22 @@ def test_the_end_of_the_x_server_is_a_loss_and_a_new_one_is_used(
         image = noise(HEIGHT, WIDTH)
         projector.show(image)
         np.testing.assert_array_equal(screenshot(screen)[..., 1], image)
+        projector.close()
+
+
+def test_a_latency_that_nobody_told_is_assumed_and_said_to_be(
+    make: Callable[..., DisplayProjector],
+) -> None:
+    with xvfb(WIDTH, HEIGHT) as screen:
+        projector = make(screen)
+        projector.connect()
+        assumed_s = projector.facts()["assumed_latency_s"]
+        assert assumed_s == pytest.approx(6 / projector.info().refresh_hz, rel=1e-3)
+        assert projector.info().latency_s == 0
+        lit = projector.show(noise(HEIGHT, WIDTH))
+        assert lit <= projector.clock.now_ns()  # the flip itself
+        projector.safe()
+        assert projector.clock.now_ns() >= lit + round(assumed_s * 1e9)
         projector.close()
 
 

@@ -508,7 +508,7 @@ def test_triggers_by_the_controls_that_a_driver_has() -> None:
     assert not toy.values[0x00981900]
     grab(cam)
     plain = connected(ToyCamera())
-    with pytest.raises(DeviceRefused, match="it has no software trigger; it has none"):
+    with pytest.raises(DeviceRefused, match="it has no software trigger; it can only run free"):
         plain.start(Acquisition.SOFTWARE)
 
 

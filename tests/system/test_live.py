@@ -137,3 +137,27 @@ def test_the_command_line(daemon: Daemon, tmp_path: Path) -> None:
         assert both.returncode == 0, both.stderr
         assert rig.status().state is RigState.IDLE
         assert preview("--count", "1").returncode == 2  # no terminal, no -o
+
+
+def test_a_preview_is_of_now_and_tells_its_age_where_it_is_not(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    def mean() -> float:
+        command = [sys.executable, "-m", "protocol.cli", "preview", "--rig", daemon.endpoint]
+        out = subprocess.run(
+            [*command, "--json", "-o", str(tmp_path / "a.png")],
+            check=True,
+            capture_output=True,
+            timeout=60,
+        ).stdout
+        facts = json.loads(out)["facts"]
+        assert facts["age_s"] < 30
+        return float(facts["mean"])
+
+    with daemon.start() as rig:
+        rig.show(umbra.WHITE)
+        white = mean()
+        rig.show(umbra.BLACK)
+        assert mean() < white / 2
+        before = rig.preview().facts["age_s"]
+        until(lambda: rig.preview().facts["age_s"] > before + 0.3)
