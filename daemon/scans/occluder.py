@@ -87,7 +87,8 @@ class OccluderMethod(Method[O]):
                 "nothing leaks into an umbra: leave the leakage away", "$.radiometry.leakage"
             )
         self._source = SourceStrength(self.response) if spec.sun else None
-        self._camera = Registration(self.response) if spec.align else None
+        mesh = self.name == "mesh"
+        self._camera = Registration(self.response, mesh=mesh) if spec.align else None
         self._place = "" if spec.align else "not looked for"
         self._aligned = 0  # frames of the present collection
         self._rejected: Counter[str] = Counter()

@@ -41,6 +41,7 @@ Spectrum = NDArray[np.complex64]
 _WORK = 320  # longer side of the pictures that are compared
 _LEAST_SIDE = 200
 _FLOOR = 0.03  # of the bright places: added to light, so that the dark ones' noise has no say
+_FOLLOWED = 0.25  # of the differences: only a mesh that was taken for the scene explains so much
 _TAPER = 0.08  # part of the picture at each edge that fades out
 _SHORTEST = (24, 16, 12, 8, 6, 4, 3, 2, *[1] * 8)
 """Wavelengths, in small pixels, that count in each round of aligning the first frames: a shake
@@ -73,8 +74,11 @@ class Shift:
 class Registration:
     """Finds each frame's shift. Deterministic; memory: `REFERENCE` small pictures at most."""
 
-    def __init__(self, response: Response) -> None:
+    def __init__(self, response: Response, *, mesh: bool = False) -> None:
+        """With `mesh` the shadow is a pattern that is alike everywhere, and could be followed."""
         self._response = response
+        self._mesh = mesh
+        self._explained = 0.0  # part of the first frames' differences that their shifts take away
         self._first: list[Spectrum] = []
         self._matched: Spectrum | None = None  # the reference over the shadow's spectrum
         self._curvature = np.zeros((2, 2))
@@ -111,7 +115,8 @@ class Registration:
     @property
     def tells(self) -> bool:
         """Whether the scene has texture enough for shifts to be known."""
-        return self.sd < UNSURE_PX
+        followed = self._mesh and self._explained > _FOLLOWED
+        return self.sd < UNSURE_PX and not followed
 
     def learn(self, pixels: NDArray[Any]) -> None:
         """Take in a frame for the reference; the last of `REFERENCE` ones makes it."""
@@ -189,6 +194,8 @@ class Registration:
         self._matched = (mean / shadow).astype(np.complex64)
         self._noise = math.sqrt(_both(np.abs(mean) ** 2 / shadow))
         self._curvature = self._information(signal / shadow)
+        unaligned = np.mean([np.abs(s - np.mean(self._first, axis=0)) ** 2 for s in self._first], 0)
+        self._explained = 1.0 - _both(shadow) / max(_both(unaligned), 1e-9)
         self.wandered = float(np.hypot(*shifts.T).max()) * self._factor
         self._differ(mean, shadow)
 
