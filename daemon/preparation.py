@@ -25,12 +25,12 @@ from daemon.motion import require_homed
 from daemon.preconditions import LightWatch, Precondition, Preconditions
 from daemon.rig import Rig
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Method
+from daemon.scans.method import Bench, Method
 from daemon.scans.pattern_scan import response_of
 from daemon.sequencer import CALL_S
 from daemon.store import RunFolder, Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
-from drivers.base import CameraInfo, CameraSettings, DeviceError
+from drivers.base import CameraSettings, DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages import Waiting
 from protocol.scans import AnyScan, OccluderScan, Radiometry, Scan
@@ -44,7 +44,7 @@ class Prepared:
     them; `exposure` where it was chosen by pictures."""
 
     method: Method[Any]
-    camera: CameraInfo
+    bench: Bench
     settings: dict[str, Any]
     calibration: dict[str, Any]
     exposure: Exposure | None
@@ -130,8 +130,8 @@ class Preparation:
             calibration = self._calibration()
         bench = self._rig.bench(calibration["values"])
         return Prepared(
-            method=method_for(self._as_exposed(), bench),
-            camera=bench.camera,
+            method=method_for(as_exposed(self._spec, self._settings), bench),
+            bench=bench,
             settings=self._settings,
             calibration=calibration,
             exposure=exposure,
@@ -166,12 +166,6 @@ class Preparation:
         if isinstance(spec, OccluderScan) and spec.frame_rate_hz is not None:
             wanted = replace(wanted, frame_rate_hz=spec.frame_rate_hz)
         return wanted
-
-    def _as_exposed(self) -> AnyScan:
-        """The spec with the exposure that was chosen, for methods to reckon with."""
-        if not self._spec.auto_exposure:
-            return self._spec
-        return msgspec.structs.replace(self._spec, exposure_us=self._settings.get("exposure_us"))
 
     def _configure(self, session: Session, wanted: CameraSettings) -> dict[str, Any]:
         camera = self._rig.camera
@@ -226,3 +220,11 @@ class Preparation:
             attempts=self._config.sequencer.attempts,
             on_picture=lambda frame, info: self._viewfinder.offer(frame, info, now=True),
         )
+
+
+def as_exposed(spec: AnyScan, settings: Mapping[str, Any]) -> AnyScan:
+    """A spec with the exposure that was chosen, for methods to reckon with; `settings` are the
+    camera's in force."""
+    if not spec.auto_exposure:
+        return spec
+    return msgspec.structs.replace(spec, exposure_us=settings.get("exposure_us"))
