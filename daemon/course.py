@@ -23,6 +23,9 @@ from daemon.calibration import Calibrations
 from daemon.config import RigConfig
 from daemon.control import Control
 from daemon.devicethread import Revoked, Session
+from daemon.exposing.apparatus import CALL_S, Apparatus
+from daemon.exposing.exposer import Behind
+from daemon.exposing.stepped import Stepped
 from daemon.failures import as_error
 from daemon.frames import FrameStore
 from daemon.recorder import Exposed, Recorder, Tally
@@ -31,7 +34,7 @@ from daemon.ring import Ring
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Method
 from daemon.separation.estimator import NotYet, Result
-from daemon.sequencer import CALL_S, Behind, Sequencer
+from daemon.sequencer import Sequencer
 from daemon.store import RunFolder, Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
 from drivers.base import CameraInfo, CameraSettings, DeviceError
@@ -230,19 +233,19 @@ class Course:
         ring: Ring,
         start: tuple[int, int],
     ) -> None:
+        apparatus = Apparatus(
+            rig=self._rig,
+            session=session,
+            method=method,
+            recorder=recorder,
+            ring=ring,
+            patience=self._config.sequencer,
+            may_go_on=self._may_go_on,
+            taken=recorder.tally.taken,
+        )
+        sequencer = Sequencer(apparatus, Stepped(apparatus), self.control, self._paused)
         try:
-            sequencer = Sequencer(
-                rig=self._rig,
-                session=session,
-                control=self.control,
-                method=method,
-                recorder=recorder,
-                ring=ring,
-                patience=self._config.sequencer,
-                may_go_on=self._may_go_on,
-                on_pause=self._paused,
-            )
-            sequencer.run(*start, taken=recorder.tally.taken)
+            sequencer.run(*start)
             self._reason = sequencer.reason
         except Behind as error:
             raise UmbraError(

@@ -17,13 +17,13 @@ import numpy as np
 import structlog
 
 from daemon.devicethread import Session
+from daemon.exposing.apparatus import CALL_S, SHOW_S
 from daemon.live import Live
 from daemon.manualstage import ManualStage
 from daemon.patterns import render
 from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench
 from daemon.scans.single_image import SingleImageMethod
-from daemon.sequencer import CALL_S, SHOW_S
 from daemon.viewfinder import Viewfinder
 from drivers.base import Acquisition, Camera, CameraInfo, CameraSettings, DeviceError, Frame
 from protocol.errors import Code, UmbraError

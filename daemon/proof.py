@@ -1,22 +1,29 @@
-"""Proof of step: whether a frame shows its own pattern, judged by what it looks like.
+"""Proof of step: whether a frame shows its own pattern, wholly, judged by what it looks like.
 
 Time stamps prove when a frame was exposed, not what the projector really showed meanwhile: it may
-flip a refresh later than it says, show the image before, or nothing. What can be known without a
-map from camera to projector:
+flip a refresh later than it says, show the image before, or nothing; and rows of a frame may have
+been exposed at another time than the stamps say. What can be known without a map from camera to
+projector:
 
-- a white frame is brighter than a black one;
-- under a pattern that is fine enough to be even over the scene, the scene as a whole is as bright
-  as the pattern's mean level says, between black and white: a black frame and a pattern that never
-  came are far from it;
-- a frame that is as good as equal to the one before, while other pairs of the same family of
-  patterns differ, shows the pattern before.
+- a white frame is brighter than a black one, and nowhere darker;
+- under a pattern that is fine enough to be even over the scene, the scene as a whole, and each
+  band of rows, is as bright as the pattern's mean level says, between black and white: a black
+  frame and a pattern that never came are far from it;
+- two frames of a family of patterns differ by as much as their images do, as other pairs of the
+  family have shown: one that is as good as equal to the frame before shows the pattern before, and
+  one of which only the upper or the lower rows are so is *torn*: it holds two patterns.
 
 Pure: no I/O, no threads. Only a sample of each frame is kept, so that it costs little.
 """
 
 from __future__ import annotations
 
+import copy
+import math
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -29,24 +36,66 @@ from daemon.separation.estimator import Lighting
 _SAMPLES = 20_000
 _BRIGHTER = 5.0  # standard errors: by how much white must be brighter than black, at least
 _OFF_LEVEL = 0.4  # of the way from black to white: how far a pattern's brightness may be off
-_SAME = 0.35  # of the usual difference between two patterns: below it they are one
-_PAIRS = 3  # pairs of a family of patterns before "usual" means anything
+_SAME = 0.35  # of the difference that two patterns should make: below it they are one
+_CHANGED = 0.65  # of it: above it they are two
+_PAIRS = 3  # pairs of a family of patterns before what they "should" make means anything
 _EVEN = 0.15  # how far a block's mean may be from the pattern's own for it to be called even
 _BLOCKS = 6  # along each side
+_STRIPS = 48  # rows of an image are looked at in so many strips, each over its whole width
+_PLACES = 64  # in each block, where two images are compared
+_EVENLY = 0.4  # of the mean change of two images: what each block must have of it
+_BANDS = 8  # of a frame's rows
+_CELLS = 16  # of a band, along its width: the light of a few tells nothing of a pattern's level
+_MANY_CELLS = 6
 #: what tells the patterns of a family apart
 _PLACE = {"shift_x", "shift_y", "shift", "phase", "seed", "index", "inverted"}
 
 Sample = NDArray[np.float32]
 
 
-def expected_level(image: NDArray[np.uint8]) -> float | None:
-    """The share of white's light that the scene as a whole gets under an image (h, w) uint8; None
-    where it is too coarse to say: parts of the scene would get more of it than others."""
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What is kept of an image to judge frames by.
+
+    `level`: the share of white's light that the scene as a whole gets under it; None where it is
+    too coarse to say: parts of the scene would get more of it than others. `places`: its values,
+    0 to 1, at fixed places in each block, (blocks, places) float32.
+    """
+
+    level: float | None
+    places: NDArray[np.float32]
+    even_rows: bool  # each narrow strip of its rows has that level, too
+
+
+def look_of(image: NDArray[np.uint8]) -> Look:
+    """The look of an image (h, w) uint8; of at least 48 rows to say anything of its level."""
     height, width = (side // _BLOCKS * _BLOCKS for side in image.shape)
     blocks = image[:height, :width].reshape(_BLOCKS, height // _BLOCKS, _BLOCKS, width // _BLOCKS)
     means = blocks.mean(axis=(1, 3)) / 255
     level = float(means.mean())
-    return level if float(np.abs(means - level).max()) <= _EVEN else None
+    even = float(np.abs(means - level).max()) <= _EVEN
+    rows = image.mean(axis=1) / 255
+    strips = np.add.reduceat(rows, _edges(len(rows))) / np.diff([*_edges(len(rows)), len(rows)])
+    even_rows = float(np.abs(strips - level).max()) <= _EVEN
+    row, column = _where(image.shape[0], image.shape[1])
+    places = image[row, column].astype(np.float32) / np.float32(255)
+    return Look(level if even else None, places, even and even_rows)
+
+
+def _edges(rows: int) -> NDArray[np.intp]:
+    """Where strips begin."""
+    return np.unique(np.arange(_STRIPS) * rows // _STRIPS)
+
+
+@lru_cache(maxsize=4)
+def _where(height: int, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the places, (blocks, places) each."""
+    rng = np.random.default_rng(0)
+    part = rng.random((2, _BLOCKS, _BLOCKS, _PLACES))
+    row = (np.arange(_BLOCKS)[:, None, None] + part[0]) / _BLOCKS * height
+    column = (np.arange(_BLOCKS)[None, :, None] + part[1]) / _BLOCKS * width
+    shape = (_BLOCKS * _BLOCKS, _PLACES)
+    return row.astype(np.intp).reshape(shape), column.astype(np.intp).reshape(shape)
 
 
 class Proof:
@@ -54,71 +103,126 @@ class Proof:
 
     def __init__(self) -> None:
         self._black: Sample | None = None
-        self._white: float | None = None
-        self._last: tuple[Expose, Sample] | None = None
+        self._white: Sample | None = None
+        self._last: tuple[Expose, Sample, Look] | None = None
         self._family: object = None
-        self._differences: deque[float] = deque(maxlen=16)
+        #: of the pairs so far: what each band's difference was of the images' own
+        self._gains: deque[NDArray[np.float64]] = deque(maxlen=16)
 
-    def problem(self, pixels: NDArray[Any], step: Expose, expected: float | None) -> str:
+    def fork(self) -> Proof:
+        """A copy that goes its own way: for frames of which it is not yet known whether they
+        count."""
+        forked = copy.copy(self)
+        forked._gains = self._gains.copy()
+        return forked
+
+    def problem(self, pixels: NDArray[Any], step: Expose, look: Look | None) -> str:
         """Why the frame (H, W) or (H, W, 3) cannot be of this step; "" if it can.
 
-        `expected` is the `expected_level` of what the projector was given.
+        `look` is the `look_of` what the projector was given.
         """
         sample = _sample(pixels)
-        level = float(sample.mean())
-        found = self._problem(sample, level, step, expected)
+        found = self._problem(sample, step, look)
         if not found:
-            self._remember(sample, level, step)
+            self._remember(sample, step, look)
         return found
 
-    def _problem(self, sample: Sample, level: float, step: Expose, expected: float | None) -> str:
+    def _problem(self, sample: Sample, step: Expose, look: Look | None) -> str:
         if step.lighting is Lighting.WHITE:
-            if self._black is not None and not _brighter(sample, self._black):
-                return "the white frame is not brighter than the black one: the projector is late"
+            return "" if self._black is None else _of_white(sample, self._black)
+        if step.lighting is not Lighting.PATTERN or look is None:
             return ""
-        if step.lighting is not Lighting.PATTERN:
-            return ""
-        return self._of_level(level, expected) or self._of_repetition(sample, step)
+        return self._of_level(sample, look) or self._of_repetition(sample, step, look)
 
-    def _of_level(self, level: float, expected: float | None) -> str:
+    def _of_level(self, sample: Sample, look: Look) -> str:
         """Compare with the levels of black and white, where the scan has taken both."""
-        if self._black is None or self._white is None or expected is None:
+        if self._black is None or self._white is None or look.level is None:
             return ""
-        black = float(self._black.mean())
-        share = (level - black) / (self._white - black)
-        if abs(share - expected) <= _OFF_LEVEL:
-            return ""
-        return (
-            f"the frame has {share:.0%} of the light of white, its pattern {expected:.0%}: "
-            "another image was shown"
-        )
+        black, white = float(self._black.mean()), float(self._white.mean())
+        share = (float(sample.mean()) - black) / (white - black)
+        if abs(share - look.level) > _OFF_LEVEL:
+            return (
+                f"the frame has {share:.0%} of the light of white, its pattern {look.level:.0%}: "
+                "another image was shown"
+            )
+        return self._of_band_levels(sample, look.level) if look.even_rows else ""
 
-    def _of_repetition(self, sample: Sample, step: Expose) -> str:
+    def _of_band_levels(self, sample: Sample, level: float) -> str:
+        """Whether the upper or the lower rows have the light of another image."""
+        assert self._black is not None
+        assert self._white is not None
+        off: list[bool | None] = []
+        for band, black, white in zip(
+            *map(_bands, (sample, self._black, self._white)), strict=True
+        ):
+            lit = white - black
+            if not _spread(lit):
+                off.append(None)
+                continue
+            share = float((band - black).mean()) / float(lit.mean())
+            off.append(abs(share - level) > _OFF_LEVEL)
+        return _torn(off, "has not the light of its pattern")
+
+    def _of_repetition(self, sample: Sample, step: Expose, look: Look) -> str:
         """Compare with the frame before, where it was of another pattern."""
         if self._last is None or self._last[0].pattern == step.pattern:
             return ""
-        if _family(step) != self._family:
+        if _family(step) != self._family or len(self._gains) < _PAIRS:
             return ""
-        difference = _difference(sample, self._last[1])
-        if len(self._differences) >= _PAIRS:
-            usual = float(np.median(self._differences))
-            if difference < _SAME * usual:
-                return "the frame shows the pattern before its own: the projector is late"
-        return ""
+        change = _change(look, self._last[2])
+        if change is None:
+            return ""
+        expected, evenly = change
+        usual = np.median(np.stack(self._gains), axis=0)
+        gains = _difference(sample, self._last[1]) / expected
+        if _whole(gains) < _SAME * _whole(usual):
+            return "the frame shows the pattern before its own: the projector is late"
+        if not evenly:
+            return ""
+        parts: list[bool | None] = [
+            True if gain < _SAME * its else False if gain > _CHANGED * its else None
+            for gain, its in zip(gains, usual, strict=True)
+        ]
+        return _torn(parts, "shows the pattern before its own")
 
-    def _remember(self, sample: Sample, level: float, step: Expose) -> None:
+    def _remember(self, sample: Sample, step: Expose, look: Look | None) -> None:
         if step.lighting is Lighting.BLACK:
             self._black = sample
         elif step.lighting is Lighting.WHITE:
-            self._white = level
-        if step.lighting is not Lighting.PATTERN:
+            self._white = sample
+        if step.lighting is not Lighting.PATTERN or look is None:
             return
         if (family := _family(step)) != self._family:
             self._family = family
-            self._differences.clear()
+            self._gains.clear()
         elif self._last is not None and self._last[0].pattern != step.pattern:
-            self._differences.append(_difference(sample, self._last[1]))
-        self._last = (step, sample)
+            change = _change(look, self._last[2])
+            if change is not None:
+                self._gains.append(_difference(sample, self._last[1]) / change[0])
+        self._last = (step, sample, look)
+
+
+def _of_white(white: Sample, black: Sample) -> str:
+    if _brightness(white - black) < _BRIGHTER:
+        return "the white frame is not brighter than the black one: the projector is late"
+    # A part of the scene that the projector does not reach is as dark as before, never darker.
+    pairs = zip(_bands(white), _bands(black), strict=True)
+    return _torn(
+        [_brightness(one - other) < -_BRIGHTER for one, other in pairs],
+        "is darker than in the black frame",
+    )
+
+
+def _torn(parts: Sequence[bool | None], how: str) -> str:
+    """What is wrong with the bands, if a run of them from the top or from the bottom is unlike the
+    rest. True: unlike; False: as it should be; None: it cannot be said."""
+    if True not in parts or False not in parts:
+        return ""
+    for name, ordered in (("upper", parts), ("lower", parts[::-1])):
+        first_good = ordered.index(False)
+        if True in ordered[:first_good] and True not in ordered[first_good:]:
+            return f"the frame is torn: its {name} part {how}"
+    return ""
 
 
 def _sample(pixels: NDArray[Any]) -> Sample:
@@ -127,10 +231,27 @@ def _sample(pixels: NDArray[Any]) -> Sample:
     return pixels[::stride, ::stride].astype(np.float32)
 
 
-def _brighter(white: Sample, black: Sample) -> bool:
-    more = white - black
+def _bands(sample: Sample) -> list[Sample]:
+    return np.array_split(sample, _BANDS)
+
+
+def _brightness(more: Sample) -> float:
+    """A mean in standard errors; 0 of an even zero."""
     standard_error = float(more.std()) / float(more.size) ** 0.5
-    return bool(float(more.mean()) > _BRIGHTER * standard_error)
+    mean = float(more.mean())
+    if not standard_error:
+        return math.copysign(math.inf, mean) if mean else 0.0
+    return mean / standard_error
+
+
+def _spread(lit: Sample) -> bool:
+    """Whether a band has light all along, so that its level is that of many of a pattern's
+    elements."""
+    if _brightness(lit) < _BRIGHTER:
+        return False
+    cells = np.array([float(cell.sum()) for cell in np.array_split(lit, _CELLS, axis=1)])
+    cells = np.clip(cells, 0.0, None)
+    return float(cells.sum() ** 2 / max(float(np.square(cells).sum()), 1e-9)) >= _MANY_CELLS
 
 
 def _family(step: Expose) -> object:
@@ -142,5 +263,21 @@ def _family(step: Expose) -> object:
     return type(pattern), tuple((name, value) for name, value in fields if name not in _PLACE)
 
 
-def _difference(one: Sample, other: Sample) -> float:
-    return float(np.sqrt(np.mean((one - other) ** 2)))
+def _change(one: Look, other: Look) -> tuple[float, bool] | None:
+    """The difference of two images (rms), and whether it is everywhere about the same. None: they
+    are as good as equal."""
+    blocks = np.square(one.places - other.places).mean(axis=1)
+    mean = float(blocks.mean())
+    if mean < 1e-4:
+        return None
+    return mean**0.5, bool(float(blocks.min()) >= _EVENLY * mean)
+
+
+def _difference(one: Sample, other: Sample) -> NDArray[np.float64]:
+    """Of two frames (rms), band by band."""
+    squares = [float(np.mean(np.square(band))) for band in _bands(one - other)]
+    return np.sqrt(np.array(squares, dtype=np.float64))
+
+
+def _whole(bands: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(bands))))

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.patterns import render
-from daemon.proof import Proof, expected_level
+from daemon.proof import Proof, look_of
 from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting
 from protocol.patterns import BLACK, WHITE, AnyPattern, Checker, GrayCode, Solid
@@ -40,8 +40,8 @@ def step(pattern: AnyPattern, lighting: Lighting = Lighting.PATTERN) -> Expose:
 
 def judged(proof: Proof, scene: Scene, asked: Expose, shown: AnyPattern | None = None) -> str:
     assert asked.pattern is not None
-    expected = expected_level(render(asked.pattern, W, H))
-    return proof.problem(scene.frame(shown or asked.pattern), asked, expected)
+    look = look_of(render(asked.pattern, W, H))
+    return proof.problem(scene.frame(shown or asked.pattern), asked, look)
 
 
 def begun(scene: Scene) -> Proof:
