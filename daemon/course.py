@@ -8,8 +8,9 @@ a failure keeps what was recorded, an abort leaves the devices safe, a full disk
 
 from __future__ import annotations
 
+import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -25,16 +26,16 @@ from daemon.control import Control
 from daemon.devicethread import Revoked, Session
 from daemon.exposing.apparatus import CALL_S, Apparatus
 from daemon.exposing.exposer import Behind
-from daemon.exposing.stepped import Stepped
+from daemon.exposing.modes import Choice, Mode, choose
 from daemon.failures import as_error
 from daemon.frames import FrameStore
 from daemon.recorder import Exposed, Recorder, Tally
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Ring
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Method
+from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet, Result
-from daemon.sequencer import Sequencer
+from daemon.sequencer import Sequencer, exposer_for
 from daemon.store import RunFolder, Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
 from drivers.base import CameraInfo, CameraSettings, DeviceError
@@ -50,6 +51,8 @@ _RESULT_S = 30.0
 TRUTH_S = 60.0
 _CONCLUDE_S = 600.0
 SUN_DEG_PER_HOUR = 15.0
+_SEQUENCE_BYTES = 256 << 20
+"""Memory for the frames of hardware-timed sequences, where `ring_frames` are fewer."""
 _STILL_S = 60.0
 """A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
 
@@ -91,6 +94,7 @@ class Course:
         self._room_seen = 0.0
         self._timings: dict[str, float] = {}
         self._exposure_s = 0.0
+        self._exposed: Counter[str] = Counter()  # see `Choice.facts`
         self._reason = ""  # why the steps ended
         self._broke_off = ""  # when an interrupted run took its last frame
         self.beat = time.monotonic()
@@ -191,6 +195,12 @@ class Course:
         bench = self._rig.bench(calibration["values"])
         method = self._method = method_for(file.spec, bench)
         info = bench.camera
+        if resuming and file.sequencing is not None:
+            self._exposed.update(file.sequencing["counts"])
+        choice = choose(file.spec, self._config.sequencer, bench, self._exposure_s * 1e6)
+        log.info("mode", mode=choice.mode, why=choice.why)
+        for warning in choice.warnings:
+            log.warning("exposure", problem=warning)
         self._room(method.planned(), info)
         self._update(
             state=RunState.RUNNING,
@@ -200,10 +210,11 @@ class Course:
             planned=method.planned(),
             rig={**self._rig.snapshot(), "settings": settings},
             calibration=calibration,
+            sequencing=choice.facts(self._exposed),
         )
         frames = self._frames(info, resuming)
         try:
-            ring = Ring(self._config.sequencer.ring_frames, info.shape, info.pixel_format.dtype)
+            ring = self._ring(choice, bench, method.planned())
             recorder = self._recorder = Recorder(method, frames, ring, self._taken)
             step, sub = self._replay(session, recorder, resuming)
             recorder.start()
@@ -211,13 +222,13 @@ class Course:
             self._timings["prepare_s"] = time.monotonic() - began
             scanning = self._rig.clock.now_ns()
             try:
-                self._sequence(session, method, recorder, ring, (step, sub))
+                self._sequence(session, method, recorder, ring, choice, (step, sub))
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.
                 try:
                     recorder.finish()
                 finally:
-                    self._count(recorder.tally)
+                    self._count(recorder.tally, choice)
             self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
             truth = self._truth(session)
             self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
@@ -231,6 +242,7 @@ class Course:
         method: Method[Any],
         recorder: Recorder,
         ring: Ring,
+        choice: Choice,
         start: tuple[int, int],
     ) -> None:
         apparatus = Apparatus(
@@ -243,7 +255,8 @@ class Course:
             may_go_on=self._may_go_on,
             taken=recorder.tally.taken,
         )
-        sequencer = Sequencer(apparatus, Stepped(apparatus), self.control, self._paused)
+        exposer = exposer_for(choice, apparatus, self.control)
+        sequencer = Sequencer(apparatus, exposer, self.control, self._paused)
         try:
             sequencer.run(*start)
             self._reason = sequencer.reason
@@ -253,6 +266,8 @@ class Course:
                 f"{self._config.rig.data}: the disk has not taken a frame for half a minute; "
                 "check it, then `umbra resume`",
             ) from error
+        finally:
+            self._exposed.update(apparatus.counts)
 
     def _truth(self, session: Session) -> dict[str, Any]:
         """What a simulated camera knows; a scan does not fail for the lack of it."""
@@ -303,6 +318,17 @@ class Course:
                 f"{self._config.rig.data}: the scan needs about {need / 1e6:.0f} MB beyond the "
                 f"reserve, {self._store.free_bytes() / 1e6:.0f} MB are free: delete old runs",
             )
+
+    def _ring(self, choice: Choice, bench: Bench, planned: int | None) -> Ring:
+        """The ring: of a sequence all frames are kept until it is known to be in step, and the one
+        before is being recorded meanwhile."""
+        info, limits = bench.camera, bench.projector.sequence if bench.projector else None
+        count = self._config.sequencer.ring_frames
+        if choice.mode is Mode.HARDWARE and limits is not None:
+            frame_bytes = math.prod(info.shape) * info.pixel_format.dtype.itemsize
+            wanted = 2 * min(limits.images, planned or limits.images)
+            count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
+        return Ring(count, info.shape, info.pixel_format.dtype)
 
     def _frames(self, info: CameraInfo, resuming: bool) -> FrameStore:
         if resuming and (self.folder.path / "frames.jsonl").exists():
@@ -402,8 +428,13 @@ class Course:
         self.folder.update(**changes)
         self._on_change()
 
-    def _count(self, tally: Tally) -> None:
-        self.folder.update(recorded=tally.recorded, missing=tally.missing, rejected=tally.rejected)
+    def _count(self, tally: Tally, choice: Choice) -> None:
+        self.folder.update(
+            recorded=tally.recorded,
+            missing=tally.missing,
+            rejected=tally.rejected,
+            sequencing=choice.facts(self._exposed),
+        )
 
     # ------------------------------------------------------------ after
 

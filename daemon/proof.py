@@ -138,6 +138,10 @@ class Proof:
         """Compare with the levels of black and white, where the scan has taken both."""
         if self._black is None or self._white is None or look.level is None:
             return ""
+        pairs = zip(_bands(sample), _bands(self._white), strict=True)
+        brighter = [_brightness(band - white) > _BRIGHTER for band, white in pairs]
+        if torn := _torn(brighter, "is brighter than in the white frame"):
+            return torn
         black, white = float(self._black.mean()), float(self._white.mean())
         share = (float(sample.mean()) - black) / (white - black)
         if abs(share - look.level) > _OFF_LEVEL:
@@ -202,6 +206,13 @@ class Proof:
         self._last = (step, sample, look)
 
 
+def head_problem(white: NDArray[Any], black: NDArray[Any]) -> str:
+    """Why two frames cannot be the white and the black image at the head of a sequence, or ""."""
+    if found := _of_white(_sample(white), _sample(black)):
+        return f"the light is not in step with the triggers: {found}"
+    return ""
+
+
 def _of_white(white: Sample, black: Sample) -> str:
     if _brightness(white - black) < _BRIGHTER:
         return "the white frame is not brighter than the black one: the projector is late"
@@ -221,7 +232,7 @@ def _torn(parts: Sequence[bool | None], how: str) -> str:
     for name, ordered in (("upper", parts), ("lower", parts[::-1])):
         first_good = ordered.index(False)
         if True in ordered[:first_good] and True not in ordered[first_good:]:
-            return f"the frame is torn: its {name} part {how}"
+            return f"a frame is torn: its {name} part {how}"
     return ""
 
 
@@ -237,7 +248,7 @@ def _bands(sample: Sample) -> list[Sample]:
 
 def _brightness(more: Sample) -> float:
     """A mean in standard errors; 0 of an even zero."""
-    standard_error = float(more.std()) / float(more.size) ** 0.5
+    standard_error = float(more.std()) / math.sqrt(more.size)
     mean = float(more.mean())
     if not standard_error:
         return math.copysign(math.inf, mean) if mean else 0.0

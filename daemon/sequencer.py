@@ -14,10 +14,29 @@ from collections.abc import Callable
 from daemon.control import Control
 from daemon.exposing.apparatus import RING_S, Apparatus
 from daemon.exposing.exposer import Behind, Exposer
+from daemon.exposing.modes import Choice, Mode
+from daemon.exposing.sequences import Sequences
+from daemon.exposing.stepped import Stepped
+from daemon.exposing.streamed import Streamed
 from daemon.exposing.video import Video
 from daemon.rig import SAFE_S
 from daemon.scans.method import Digest, Expose, Watch
 from drivers.base import DeviceError
+
+
+def exposer_for(choice: Choice, apparatus: Apparatus, control: Control) -> Exposer:
+    """The way of exposing that a choice names."""
+    triggers = apparatus.info.triggers
+    if choice.mode is Mode.FREE:
+        return Streamed(apparatus)
+    if choice.mode is not Mode.HARDWARE:
+        return Stepped(apparatus)
+    single: Exposer | None = None
+    if "software" in triggers:
+        single = Stepped(apparatus)
+    elif "none" in triggers:
+        single = Streamed(apparatus)
+    return Sequences(apparatus, control, single, strict=choice.strict)
 
 
 class Sequencer:

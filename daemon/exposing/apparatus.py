@@ -87,7 +87,8 @@ class Apparatus:
         calibration = method.bench.calibration or {}
         self._latency_ns = round(float(calibration.get("latency_s", 0.0)) * NS)
         self._tone: list[int] | None = calibration.get("tone")
-        self._exposure_us = self.camera.device.settings().exposure_us
+        #: of a step that asks for none
+        self.first_exposure_us = self.camera.device.settings().exposure_us
         self._acquisition: Acquisition | None = None
         self._taken = taken
         self._drawing: Drawing | None = None
@@ -119,10 +120,10 @@ class Apparatus:
             + self.patience.frame_timeout_s
         )
 
-    def acquire(self, wanted: Acquisition) -> None:
-        """Have the camera acquire in this way from now on, if it does not already."""
+    def acquire(self, wanted: Acquisition) -> bool:
+        """Have the camera acquire in this way from now on; whether it did not already."""
         if self._acquisition is wanted:
-            return
+            return False
         at = self._taken
 
         def start(camera: Camera) -> None:
@@ -131,6 +132,7 @@ class Apparatus:
 
         self.camera.call(start, CALL_S, self.session)
         self._acquisition = wanted
+        return True
 
     def stop(self) -> None:
         """End acquisition: nothing in the camera's queue can be trusted any more."""
@@ -139,7 +141,7 @@ class Apparatus:
 
     def needs_exposure(self, wanted_us: float | None) -> bool:
         """Whether the camera must be set before it exposes for so long; None: as at the start."""
-        wanted_us = wanted_us or self._exposure_us
+        wanted_us = wanted_us or self.first_exposure_us
         return wanted_us is not None and wanted_us != self.camera.device.settings().exposure_us
 
     def set_exposure(self, wanted_us: float | None) -> None:
@@ -147,7 +149,7 @@ class Apparatus:
         if not self.needs_exposure(wanted_us):
             return
         self.stop()
-        wanted = CameraSettings(exposure_us=wanted_us or self._exposure_us)
+        wanted = CameraSettings(exposure_us=wanted_us or self.first_exposure_us)
         self.camera.call(lambda c: c.configure(wanted), CALL_S, self.session)
 
     def buffer(self) -> Buffer:
