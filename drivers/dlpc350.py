@@ -158,6 +158,7 @@ class Dlpc350Projector(Projector):
         self._dark("stop")
 
     def _dark(self, phase: str) -> None:
+        self._halted.clear()  # what was halted has ended; this must not end with it
         try:
             self._write(Command.LEDS, p.LEDS_OFF, phase)  # first: it is dark from here on
             self._showing = None
