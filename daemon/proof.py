@@ -51,6 +51,9 @@ _MANY_CELLS = 6
 _PLACE = {"shift_x", "shift_y", "shift", "phase", "seed", "index", "inverted"}
 
 Sample = NDArray[np.float32]
+"""Of a frame: (bands, rows of each, samples along a row)."""
+Bands = NDArray[np.float64]
+"""One figure a band."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,23 +71,19 @@ class Look:
 
 
 def look_of(image: NDArray[np.uint8]) -> Look:
-    """The look of an image (h, w) uint8; of at least 48 rows to say anything of its level."""
+    """The look of an image (h, w) uint8, 6 x 6 pixels at least."""
     height, width = (side // _BLOCKS * _BLOCKS for side in image.shape)
-    blocks = image[:height, :width].reshape(_BLOCKS, height // _BLOCKS, _BLOCKS, width // _BLOCKS)
-    means = blocks.mean(axis=(1, 3)) / 255
+    along = image[:height, :width].reshape(height, _BLOCKS, width // _BLOCKS)
+    rows = along.sum(axis=2, dtype=np.uint32) / (255.0 * (width // _BLOCKS))  # of each block
+    means = rows.reshape(_BLOCKS, height // _BLOCKS, _BLOCKS).mean(axis=1)
     level = float(means.mean())
     even = float(np.abs(means - level).max()) <= _EVEN
-    rows = image.mean(axis=1) / 255
-    strips = np.add.reduceat(rows, _edges(len(rows))) / np.diff([*_edges(len(rows)), len(rows)])
+    edges = np.unique(np.arange(_STRIPS) * height // _STRIPS)
+    strips = np.add.reduceat(rows.mean(axis=1), edges) / np.diff(edges, append=height)
     even_rows = float(np.abs(strips - level).max()) <= _EVEN
     row, column = _where(image.shape[0], image.shape[1])
     places = image[row, column].astype(np.float32) / np.float32(255)
     return Look(level if even else None, places, even and even_rows)
-
-
-def _edges(rows: int) -> NDArray[np.intp]:
-    """Where strips begin."""
-    return np.unique(np.arange(_STRIPS) * rows // _STRIPS)
 
 
 @lru_cache(maxsize=4)
@@ -98,16 +97,36 @@ def _where(height: int, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]
     return row.astype(np.intp).reshape(shape), column.astype(np.intp).reshape(shape)
 
 
+@dataclass(frozen=True, slots=True)
+class _Scale:
+    """Between what black and what white a scan is: means of each band, and whether it has light all
+    along, so that its level is that of many of a pattern's elements."""
+
+    black: Bands
+    white: Bands
+    spread: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, black: Sample, white: Sample) -> _Scale:
+        lit = white - black
+        cells = np.array_split(lit, _CELLS, axis=2)
+        sums = np.clip([cell.sum(axis=(1, 2), dtype=np.float64) for cell in cells], 0.0, None)
+        many = sums.sum(axis=0) ** 2 >= _MANY_CELLS * np.square(sums).sum(axis=0)
+        spread = many & (_brightness(lit) >= _BRIGHTER)
+        return cls(_means(black), _means(white), tuple(spread.tolist()))
+
+
 class Proof:
     """Judges frame after frame of one scan; a frame that failed is forgotten, not compared with."""
 
     def __init__(self) -> None:
         self._black: Sample | None = None
         self._white: Sample | None = None
+        self._scale: _Scale | None = None  # once there are both
         self._last: tuple[Expose, Sample, Look] | None = None
         self._family: object = None
         #: of the pairs so far: what each band's difference was of the images' own
-        self._gains: deque[NDArray[np.float64]] = deque(maxlen=16)
+        self._gains: deque[Bands] = deque(maxlen=16)
 
     def fork(self) -> Proof:
         """A copy that goes its own way: for frames of which it is not yet known whether they
@@ -136,35 +155,27 @@ class Proof:
 
     def _of_level(self, sample: Sample, look: Look) -> str:
         """Compare with the levels of black and white, where the scan has taken both."""
-        if self._black is None or self._white is None or look.level is None:
+        scale = self._scale
+        if scale is None or self._white is None or look.level is None:
             return ""
-        pairs = zip(_bands(sample), _bands(self._white), strict=True)
-        brighter = [_brightness(band - white) > _BRIGHTER for band, white in pairs]
-        if torn := _torn(brighter, "is brighter than in the white frame"):
-            return torn
-        black, white = float(self._black.mean()), float(self._white.mean())
-        share = (float(sample.mean()) - black) / (white - black)
+        means = _means(sample)
+        if bool((means > scale.white).any()):
+            brighter = _brightness(sample - self._white) > _BRIGHTER
+            if torn := _torn(brighter.tolist(), "is brighter than in the white frame"):
+                return torn
+        lit = scale.white - scale.black
+        share = float((means - scale.black).sum()) / float(lit.sum())
         if abs(share - look.level) > _OFF_LEVEL:
             return (
                 f"the frame has {share:.0%} of the light of white, its pattern {look.level:.0%}: "
                 "another image was shown"
             )
-        return self._of_band_levels(sample, look.level) if look.even_rows else ""
-
-    def _of_band_levels(self, sample: Sample, level: float) -> str:
-        """Whether the upper or the lower rows have the light of another image."""
-        assert self._black is not None
-        assert self._white is not None
-        off: list[bool | None] = []
-        for band, black, white in zip(
-            *map(_bands, (sample, self._black, self._white)), strict=True
-        ):
-            lit = white - black
-            if not _spread(lit):
-                off.append(None)
-                continue
-            share = float((band - black).mean()) / float(lit.mean())
-            off.append(abs(share - level) > _OFF_LEVEL)
+        if not look.even_rows:
+            return ""
+        off = [
+            abs((mean - black) / more - look.level) > _OFF_LEVEL if spread else None
+            for mean, black, more, spread in zip(means, scale.black, lit, scale.spread, strict=True)
+        ]
         return _torn(off, "has not the light of its pattern")
 
     def _of_repetition(self, sample: Sample, step: Expose, look: Look) -> str:
@@ -191,9 +202,11 @@ class Proof:
 
     def _remember(self, sample: Sample, step: Expose, look: Look | None) -> None:
         if step.lighting is Lighting.BLACK:
-            self._black = sample
+            self._black, self._scale = sample, None
         elif step.lighting is Lighting.WHITE:
-            self._white = sample
+            self._white, self._scale = sample, None
+        if self._scale is None and self._black is not None and self._white is not None:
+            self._scale = _Scale.of(self._black, self._white)
         if step.lighting is not Lighting.PATTERN or look is None:
             return
         if (family := _family(step)) != self._family:
@@ -214,14 +227,12 @@ def head_problem(white: NDArray[Any], black: NDArray[Any]) -> str:
 
 
 def _of_white(white: Sample, black: Sample) -> str:
-    if _brightness(white - black) < _BRIGHTER:
+    more = white - black
+    if float(_brightness(more.reshape(1, 1, -1))[0]) < _BRIGHTER:
         return "the white frame is not brighter than the black one: the projector is late"
     # A part of the scene that the projector does not reach is as dark as before, never darker.
-    pairs = zip(_bands(white), _bands(black), strict=True)
-    return _torn(
-        [_brightness(one - other) < -_BRIGHTER for one, other in pairs],
-        "is darker than in the black frame",
-    )
+    darker = _brightness(more) < -_BRIGHTER
+    return _torn(darker.tolist(), "is darker than in the black frame")
 
 
 def _torn(parts: Sequence[bool | None], how: str) -> str:
@@ -239,30 +250,23 @@ def _torn(parts: Sequence[bool | None], how: str) -> str:
 def _sample(pixels: NDArray[Any]) -> Sample:
     """Some pixels of a frame, spread evenly; of a mosaic whole cells, so that colours mix alike."""
     stride = max(1, round((pixels.shape[0] * pixels.shape[1] / _SAMPLES) ** 0.5)) | 1
-    return pixels[::stride, ::stride].astype(np.float32)
+    some = pixels[::stride, ::stride]
+    bands = min(_BANDS, some.shape[0])
+    rows = some.shape[0] // bands
+    return some[: bands * rows].reshape(bands, rows, -1).astype(np.float32)
 
 
-def _bands(sample: Sample) -> list[Sample]:
-    return np.array_split(sample, _BANDS)
+def _means(sample: Sample) -> Bands:
+    return np.asarray(sample.mean(axis=(1, 2), dtype=np.float64))
 
 
-def _brightness(more: Sample) -> float:
-    """A mean in standard errors; 0 of an even zero."""
-    standard_error = float(more.std()) / math.sqrt(more.size)
-    mean = float(more.mean())
-    if not standard_error:
-        return math.copysign(math.inf, mean) if mean else 0.0
-    return mean / standard_error
-
-
-def _spread(lit: Sample) -> bool:
-    """Whether a band has light all along, so that its level is that of many of a pattern's
-    elements."""
-    if _brightness(lit) < _BRIGHTER:
-        return False
-    cells = np.array([float(cell.sum()) for cell in np.array_split(lit, _CELLS, axis=1)])
-    cells = np.clip(cells, 0.0, None)
-    return float(cells.sum() ** 2 / max(float(np.square(cells).sum()), 1e-9)) >= _MANY_CELLS
+def _brightness(more: Sample) -> Bands:
+    """The mean of each band in standard errors; 0 where all is 0."""
+    flat = more.reshape(len(more), -1)
+    mean = flat.mean(axis=1, dtype=np.float64)
+    error = flat.std(axis=1, dtype=np.float64) / math.sqrt(flat.shape[1])
+    error = np.maximum(error, 1e-12)  # of an even difference: endlessly sure
+    return np.asarray(mean / error)
 
 
 def _family(step: Expose) -> object:
@@ -284,11 +288,12 @@ def _change(one: Look, other: Look) -> tuple[float, bool] | None:
     return mean**0.5, bool(float(blocks.min()) >= _EVENLY * mean)
 
 
-def _difference(one: Sample, other: Sample) -> NDArray[np.float64]:
+def _difference(one: Sample, other: Sample) -> Bands:
     """Of two frames (rms), band by band."""
-    squares = [float(np.mean(np.square(band))) for band in _bands(one - other)]
-    return np.sqrt(np.array(squares, dtype=np.float64))
+    flat = (one - other).reshape(len(one), -1)
+    squares = np.einsum("bn,bn->b", flat, flat, dtype=np.float64)
+    return np.asarray(np.sqrt(squares / flat.shape[1]))
 
 
-def _whole(bands: NDArray[np.float64]) -> float:
+def _whole(bands: Bands) -> float:
     return float(np.sqrt(np.mean(np.square(bands))))
