@@ -19,18 +19,18 @@ from daemon.calibration import Calibrations
 from daemon.config import RigConfig
 from daemon.control import Control
 from daemon.devicethread import Session
+from daemon.exposing.apparatus import CALL_S
 from daemon.lightmeter import LightMeter, require_meterable
 from daemon.metering import Exposure, Level
 from daemon.motion import require_homed
 from daemon.preconditions import LightWatch, Precondition, Preconditions
 from daemon.rig import Rig
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Method
+from daemon.scans.method import Bench, Method
 from daemon.scans.pattern_scan import response_of
-from daemon.sequencer import CALL_S
 from daemon.store import RunFolder, Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
-from drivers.base import CameraInfo, CameraSettings, DeviceError
+from drivers.base import CameraSettings, DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages import Waiting
 from protocol.scans import AnyScan, OccluderScan, Radiometry, Scan
@@ -44,7 +44,7 @@ class Prepared:
     them; `exposure` where it was chosen by pictures."""
 
     method: Method[Any]
-    camera: CameraInfo
+    bench: Bench
     settings: dict[str, Any]
     calibration: dict[str, Any]
     exposure: Exposure | None
@@ -131,7 +131,7 @@ class Preparation:
         bench = self._rig.bench(calibration["values"])
         return Prepared(
             method=method_for(self._as_exposed(), bench),
-            camera=bench.camera,
+            bench=bench,
             settings=self._settings,
             calibration=calibration,
             exposure=exposure,

@@ -71,6 +71,7 @@ class RunFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     order: int = 0
     rig: dict[str, Any] = {}
     calibration: dict[str, Any] | None = None
+    sequencing: dict[str, Any] | None = None
     versions: dict[str, str] = {}
     timings: dict[str, float] = {}
     estimates: dict[str, float] = {}

@@ -10,6 +10,7 @@ import numpy as np
 
 from daemon.devicethread import DeviceThread, Session
 from daemon.doctor.verdict import failed, ok, skipped, warning
+from daemon.exposing.modes import whole_periods
 from drivers.base import Acquisition, Camera, DeviceRefused, Light, Projector
 from drivers.clock import NS, Clock
 from protocol.messages import Check
@@ -124,9 +125,9 @@ def periods(exposure_us: float, refresh_hz: float) -> Check:
     name = "camera: exposure"
     ratio = exposure_us * 1e-6 * refresh_hz
     told = f"{exposure_us / 1e3:.2f} ms are {ratio:.2f} periods of the projector"
-    if ratio > 0.98 and abs(ratio - round(ratio)) < 0.02 * max(1.0, ratio):
+    whole = whole_periods(exposure_us, refresh_hz)
+    if whole is None:
         return ok(name, told)
-    whole = max(1, round(ratio)) / refresh_hz * 1e6
     return warning(
         name,
         f"{told}: one that flickers (colour wheel, PWM) makes stripes and noise",
