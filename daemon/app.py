@@ -2,6 +2,7 @@
 
 Start:  config -> store (held) -> sockets bound -> devices connected -> queue served -> READY=1
 Stop:   STOPPING=1 -> the run is interrupted -> devices safe and closed -> sockets closed -> 0
+        a second signal: devices safe -> 0, and nothing else is waited for
 
 Exit codes: 0 stopped as asked, 1 could not start or broke, 2 the configuration cannot be used.
 """
@@ -31,13 +32,13 @@ from daemon.doctor.examination import Doctor
 from daemon.manual import Manual
 from daemon.notify import Notifier
 from daemon.publisher import HIGH_WATER, Publisher
-from daemon.rig import Rig
+from daemon.rig import SAFE_S, Rig
 from daemon.runner import LOCK, Runner
 from daemon.server import Server
 from daemon.store import Store
 from daemon.viewfinder import Glimpse, Viewfinder
 from protocol.errors import UmbraError
-from protocol.messages import AnyEvent, DeviceChanged, DeviceInfo, PreviewTaken
+from protocol.messages import AnyEvent, DeviceChanged, DeviceInfo, Logged, PreviewTaken
 
 _TEND_S = 1.0
 _SWITCH_S = 0.0005
@@ -94,15 +95,15 @@ class _Daemon:
         self._book = book
         self._notifier = Notifier()
         self._stop = asyncio.Event()
+        self._hurry = asyncio.Event()
         self._reason = ""
         self._broken = False
         self._tasks: list[asyncio.Task[None]] = []
 
     async def run(self, *, until_eof: bool) -> None:
         """Start, serve until asked to stop, stop. Raises UmbraError, ConfigError."""
-        loop = asyncio.get_running_loop()
+        loop, epoch = asyncio.get_running_loop(), secrets.token_hex(6)
         self._heed_signals(loop)
-        epoch = secrets.token_hex(6)
         with contextlib.ExitStack() as stack:
             store = stack.enter_context(
                 Store(Path(self._config.rig.data), self._config.storage.reserve_mb << 20)
@@ -115,6 +116,8 @@ class _Daemon:
             commands_socket = self._bind(context, zmq.ROUTER, access, self._config.network.command)
             events_socket = self._bind(context, zmq.PUB, access, self._config.network.events)
             publisher = Publisher(zmq.Socket.shadow(events_socket), epoch)
+
+            self._publish_log(loop, stack, store, publisher)
 
             def publish(body: AnyEvent) -> None:
                 loop.call_soon_threadsafe(publisher.publish, body)
@@ -162,8 +165,8 @@ class _Daemon:
                 book=self._book,
                 epoch=epoch,
             )
-            runner.recover()
             running = None
+            runner.recover()
             try:
                 await asyncio.to_thread(rig.connect)
                 self._serve(Server(commands_socket, commands.handle, access.caller).serve())
@@ -184,7 +187,28 @@ class _Daemon:
 
     def _heed_signals(self, loop: asyncio.AbstractEventLoop) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self._ask_to_stop, number.name)
+            loop.add_signal_handler(number, self._signalled, number.name)
+
+    def _publish_log(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        stack: contextlib.ExitStack,
+        store: Store,
+        publisher: Publisher,
+    ) -> None:
+        """What is logged goes to the runs' folders and to subscribers, until the sockets close."""
+        closed = threading.Event()
+        stack.callback(closed.set)
+
+        def tell(record: dict[str, Any]) -> None:
+            if not closed.is_set():
+                publisher.publish(Logged(record=record))
+
+        def logged(record: dict[str, Any]) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(tell, record)
+
+        self._book.open(store.runs_folder, logged)
 
     def _log_ready(self) -> None:
         network = self._config.network
@@ -203,12 +227,38 @@ class _Daemon:
         log.info("stopping", reason=self._reason)
         self._notifier.stopping()
         runner.stop()
-        if running is not None:
-            await asyncio.wait([running])
-        await asyncio.to_thread(rig.close)
+        orderly = asyncio.create_task(self._let_go(rig, running))
+        hurried = asyncio.create_task(self._hurry.wait())
+        await asyncio.wait([orderly, hurried], return_when=asyncio.FIRST_COMPLETED)
+        if not orderly.done():
+            await self._leave_at_once(rig)
+        hurried.cancel()
+        await orderly
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        for number in (signal.SIGTERM, signal.SIGINT):  # one more is no reason to die of it
+            asyncio.get_running_loop().remove_signal_handler(number)
+            signal.signal(number, signal.SIG_IGN)
+
+    async def _let_go(self, rig: Rig, running: asyncio.Task[None] | None) -> None:
+        """Wait for the run to be written to its end, and close the devices."""
+        if running is not None:
+            await asyncio.wait([running])
+        await asyncio.to_thread(rig.close)
+
+    async def _leave_at_once(self, rig: Rig) -> None:
+        """Asked twice: make the rig safe, and be gone without waiting for any thread.
+
+        What was acknowledged is durable; the next start finds the run interrupted, as after a
+        crash. The process ends here, for a thread that hangs would keep an orderly exit from
+        coming.
+        """
+        log.warning("stopping in a hurry: the run's end and the devices are not waited for")
+        safe = await asyncio.to_thread(lambda: rig.safe_within(rig.make_safe(), SAFE_S))
+        log.warning("stopped in a hurry", safe=safe)
+        sys.stdout.flush()
+        os._exit(1 if self._broken else 0)
 
     # ------------------------------------------------------------ pieces
 
@@ -283,6 +333,12 @@ class _Daemon:
     def _ask_to_stop(self, reason: str) -> None:
         self._reason = self._reason or reason
         self._stop.set()
+
+    def _signalled(self, name: str) -> None:
+        """The first signal stops, the next one hurries."""
+        if self._stop.is_set():
+            self._hurry.set()
+        self._ask_to_stop(name)
 
     def _until_eof(self, loop: asyncio.AbstractEventLoop) -> None:
         def read() -> None:

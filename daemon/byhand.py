@@ -17,6 +17,7 @@ from daemon.config import RigConfig
 from daemon.manual import Manual
 from daemon.rig import Rig
 from daemon.runner import LOCK, Runner
+from daemon.scans.pattern_scan import response_of
 from daemon.server import Answer, Asked
 from daemon.store import Store
 from daemon.viewfinder import facts_of
@@ -24,6 +25,7 @@ from drivers.base import CameraSettings as DriverSettings
 from drivers.base import PixelFormat
 from protocol import messages as m
 from protocol.errors import Code, UmbraError
+from protocol.scans import Radiometry
 
 T = TypeVar("T")
 
@@ -110,6 +112,13 @@ class ByHand:
         values: dict[str, Any] = found.of(self._rig.snapshot(), settings)["values"]
         return values
 
+    def _expose(self, wanted: DriverSettings) -> dict[str, Any]:
+        """Choose the exposure; of `wanted` it is the longest."""
+        bench = self._rig.bench(self._calibration())
+        if bench.camera.recorded:
+            raise UmbraError(Code.UNSUITABLE, "a recording's exposure is as it was taken")
+        return self._manual.expose(wanted, response_of(Radiometry(), bench)).facts()
+
     async def _stop_live(self, _: m.StopLive, __: Asked) -> Answer:
         await asyncio.to_thread(self._manual.live.stop)
         return Answer(m.Done(message="the live view has ended"))
@@ -133,6 +142,10 @@ class ByHand:
 
     async def _camera(self, command: m.SetCamera, asked: Asked) -> Answer:
         wanted = _settings(command.settings)
+        if command.auto_exposure:
+            facts = await self.do(asked, lambda: self._expose(wanted))
+            in_force = self._rig.camera.device.settings()
+            return Answer(m.Camera(settings=m.CameraSettings(**asdict(in_force)), facts=facts))
         if wanted == DriverSettings():
             in_force = self._rig.camera.device.settings()
         else:

@@ -71,7 +71,21 @@ class Calibrations:
                 reasons.append({"kind": kind, "run": run.id, "why": why or "it cannot be read"})
             else:
                 ignored += reasons[:1]
+        if own != "latency" and "latency_s" not in values:
+            ignored += self._assumed_latency(rig, values)
         return {"values": values, "sources": sources, "ignored": ignored}
+
+    def _assumed_latency(
+        self, rig: Mapping[str, Any], values: dict[str, Any]
+    ) -> list[dict[str, str]]:
+        """What a projector whose latency nobody has measured asks to be waited for, put into
+        `values`."""
+        assumed = rig.get("projector", {}).get("facts", {}).get("assumed_latency_s")
+        if not assumed:
+            return []
+        values["latency_s"] = assumed
+        why = f"never measured; {assumed * 1e3:.0f} ms are waited for after each flip"
+        return [{"kind": "latency", "run": "", "why": why}]
 
     def _newest_first(self) -> list[tuple[RunFolder, str]]:
         return [

@@ -117,8 +117,12 @@ class Commands:
             return m.RigState.STOPPING
         if self._estopped:
             return m.RigState.ESTOPPED
-        if self._runner.current is not None:
-            return m.RigState.SCANNING
+        if (current := self._runner.current) is not None:
+            of = {
+                m.RunState.WAITING: m.RigState.WAITING,
+                m.RunState.PAUSED: m.RigState.PAUSED,
+            }
+            return of.get(current.file.state, m.RigState.SCANNING)
         return m.RigState.MANUAL if self._manual.active else m.RigState.IDLE
 
     # ------------------------------------------------------------ facts
@@ -192,7 +196,8 @@ class Commands:
     async def _log(self, command: m.GetLog, _: Asked) -> Answer:
         if command.run:
             await asyncio.to_thread(self._store.open, command.run)  # a name that is wrong is said
-        return Answer(m.Log(records=self._book.records(command.run, command.limit)))
+        records = await asyncio.to_thread(self._book.records, command.run, command.limit)
+        return Answer(m.Log(records=records))
 
     # ------------------------------------------------------------ runs
 
@@ -351,7 +356,8 @@ class Commands:
 def _looked(glimpse: Glimpse, width: int) -> Answer:
     small = picture.narrowed(glimpse.picture, width)
     arrays = {"preview": small, "saturated": cells(glimpse.saturated, *small.shape[:2])}
-    return Answer(m.Picture(facts={**glimpse.facts, "run": glimpse.run}), arrays)
+    age_s = round(time.monotonic() - glimpse.at_s, 1)
+    return Answer(m.Picture(facts={**glimpse.facts, "run": glimpse.run, "age_s": age_s}), arrays)
 
 
 def _about(run: RunFolder) -> Answer:

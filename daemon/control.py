@@ -21,6 +21,8 @@ class Control:
         self._go.set()
         self._reason = ""
         self._end: End | None = None
+        self.news = threading.Event()
+        """Set when whoever waits for something should look again: the end, a device's health."""
 
     def pause(self, reason: str) -> None:
         """Ask for a pause after the step under way."""
@@ -38,6 +40,7 @@ class Control:
             if self._end is None:
                 self._end = End(state=state, reason=reason, code=code, by=by)
         self._go.set()
+        self.news.set()
 
     @property
     def verdict(self) -> End | None:
@@ -62,6 +65,11 @@ class Control:
             session.check()
         self.check(session)
         return True
+
+    def await_resume(self) -> bool:
+        """Wait, in a thread that has no devices, until the pause is over; False: the run ends."""
+        self._go.wait()
+        return self._end is None
 
     def check(self, session: Session) -> None:
         """Raise Revoked when the run must end, also before its session has been revoked."""

@@ -2,7 +2,8 @@
 
     prepare -> (replay what an interruption left) -> steps -> products -> end
 
-Everything between is the sequencer's and the recorder's; here it is decided what an end means:
+What comes before the first frame is in `daemon.preparation`, the steps are the sequencer's and the
+recorder's; here it is decided what an end means:
 a failure keeps what was recorded, an abort leaves the devices safe, a full disk only pauses.
 """
 
@@ -12,37 +13,36 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-import msgspec
 import structlog
 
 from daemon import products
-from daemon.calibration import Calibrations
 from daemon.config import RigConfig
 from daemon.control import Control
 from daemon.devicethread import Revoked, Session
-from daemon.exposing.apparatus import CALL_S, Apparatus
+from daemon.durable import StorageError
+from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.exposer import Behind
 from daemon.exposing.modes import Choice, Mode, choose
 from daemon.failures import as_error
 from daemon.frames import FrameStore
+from daemon.preparation import Preparation
 from daemon.recorder import Exposed, Recorder, Tally
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Ring
-from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet, Result
 from daemon.sequencer import Sequencer, exposer_for
-from daemon.store import RunFolder, Store, estimate_bytes
+from daemon.store import RunFolder, Store
 from daemon.viewfinder import Viewfinder
-from drivers.base import CameraInfo, CameraSettings, DeviceError
+from drivers.base import CameraInfo, DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Progress, RunState
-from protocol.scans import OccluderScan, Spec
+from protocol.messages import End, Progress, RunState, Waiting
+from protocol.scans import OccluderScan, PatternScan
 
 _PROGRESS_S = 0.1
 _ROOM_S = 1.0
@@ -97,6 +97,8 @@ class Course:
         self._exposed: Counter[str] = Counter()  # see `Choice.facts`
         self._reason = ""  # why the steps ended
         self._broke_off = ""  # when an interrupted run took its last frame
+        self._waits: Waiting | None = None
+        self._for_room = False  # the pause is for lack of room on the disk
         self.beat = time.monotonic()
 
     # ------------------------------------------------------------ for others
@@ -122,6 +124,7 @@ class Course:
             remaining_s=left,
             phase=self._phase,
             summary=summary,
+            waits=self._waits,
         )
 
     def result(self) -> Result:
@@ -139,6 +142,8 @@ class Course:
         """Whether it has moved lately. In a pause there is nothing to move."""
         state = self.folder.file.state
         limit = _CONCLUDE_S if state is RunState.FINISHING else _STILL_S + 2 * self._exposure_s
+        if state is RunState.WAITING:
+            limit += self.folder.file.spec.ready.look_s
         return state is RunState.PAUSED or time.monotonic() - self.beat < limit
 
     def _rate(self) -> float:
@@ -153,10 +158,20 @@ class Course:
         """Run to the end; never raises. The devices are safe when it returns."""
         structlog.contextvars.bind_contextvars(run=self.folder.id)
         session: Session | None = None
+        preparation = Preparation(
+            self.folder,
+            rig=self._rig,
+            store=self._store,
+            config=self._config,
+            control=self.control,
+            viewfinder=self._viewfinder,
+            on_wait=self._wait,
+            beat=self._alive,
+        )
         try:
             session = self._rig.take(f"run {self.folder.id}")
             self.control.check(session)  # what came before there was a session to revoke
-            end = self._execute(session)
+            end = self._execute(session, preparation)
         except Revoked:
             end = self.control.verdict or End(
                 state=RunState.INTERRUPTED, reason="the devices were taken away"
@@ -175,47 +190,46 @@ class Course:
                 # Whoever revoked the session has sent the devices there already: this waits.
                 futures = self._rig.make_safe(halt=not session.ended.is_set())
                 self._rig.safe_within(futures, SAFE_S)
+                preparation.restore()
                 self._rig.leave(session)
         self._close(end)
         return end
 
-    def _execute(self, session: Session) -> End:
+    def _execute(self, session: Session, preparation: Preparation) -> End:
         began = time.monotonic()
         file = self.folder.file
         resuming = bool(file.started)
-        self._rig.require_ready()
         self._broke_off = self._last_frame() if resuming else ""
-        if resuming:
-            self._same_devices(file.rig)
-        settings = self._configure(session, file.spec, file.rig if resuming else None)
-        calibration = file.calibration if resuming else None
-        if calibration is None:
-            found = Calibrations(self._store, self._config.calibration.max_age_days)
-            calibration = found.of(self._rig.snapshot(), settings, file.spec)
-        bench = self._rig.bench(calibration["values"])
-        method = self._method = method_for(file.spec, bench)
-        info = bench.camera
-        if resuming and file.sequencing is not None:
-            self._exposed.update(file.sequencing["counts"])
-        choice = choose(file.spec, self._config.sequencer, bench, self._exposure_s * 1e6)
-        log.info("mode", mode=choice.mode, why=choice.why)
-        for warning in choice.warnings:
-            log.warning("exposure", problem=warning)
-        self._room(method.planned(), info)
+        prepared = preparation.prepare(session, resuming=resuming)
+        method = self._method = prepared.method
+        info, exposure = prepared.camera, prepared.exposure
+        self._exposure_s = prepared.settings.get("exposure_us", 0.0) * 1e-6
+        bench = self._rig.bench(prepared.calibration["values"])
+        choice = self._choose(bench, resuming)
+        if isinstance(file.spec, PatternScan) and file.spec.bracket is not None:
+            self._exposure_s *= max(file.spec.bracket)  # how long it may show no sign of life
+        self._waits = None
+        rig = {**self._rig.snapshot(), "settings": prepared.settings}
+        if exposure is not None:
+            rig["exposure"] = exposure.facts()
+        elif resuming and (chosen := file.rig.get("exposure")):
+            rig["exposure"] = chosen
         self._update(
             state=RunState.RUNNING,
             started=file.started or utc_now(),
             ended="",
             end=None,
             planned=method.planned(),
-            rig={**self._rig.snapshot(), "settings": settings},
-            calibration=calibration,
+            rig=rig,
+            calibration=prepared.calibration,
             sequencing=choice.facts(self._exposed),
         )
+        if prepared.waited_s:
+            self._timings["waited_s"] = prepared.waited_s
         frames = self._frames(info, resuming)
         try:
             ring = self._ring(choice, bench, method.planned())
-            recorder = self._recorder = Recorder(method, frames, ring, self._taken)
+            recorder = self._recorder = Recorder(method, frames, ring, self._taken, self._disk_full)
             step, sub = self._replay(session, recorder, resuming)
             recorder.start()
             self._say("scanning")
@@ -248,15 +262,16 @@ class Course:
         apparatus = Apparatus(
             rig=self._rig,
             session=session,
+            control=self.control,
             method=method,
             recorder=recorder,
             ring=ring,
             patience=self._config.sequencer,
             may_go_on=self._may_go_on,
+            on_pause=self._paused,
             taken=recorder.tally.taken,
         )
-        exposer = exposer_for(choice, apparatus, self.control)
-        sequencer = Sequencer(apparatus, exposer, self.control, self._paused)
+        sequencer = Sequencer(apparatus, exposer_for(choice, apparatus))
         try:
             sequencer.run(*start)
             self._reason = sequencer.reason
@@ -279,45 +294,16 @@ class Course:
 
     # ------------------------------------------------------------ before
 
-    def _configure(
-        self, session: Session, spec: Spec, before: Mapping[str, Any] | None
-    ) -> dict[str, Any]:
-        """Set the camera as the spec asks, or exactly as it was before an interruption."""
-        wanted = CameraSettings(exposure_us=spec.exposure_us, gain=spec.gain)
-        if before is not None and (known := before.get("settings")):
-            wanted = msgspec.convert(known, CameraSettings)
-        if isinstance(spec, OccluderScan) and spec.frame_rate_hz is not None:
-            wanted = replace(wanted, frame_rate_hz=spec.frame_rate_hz)
-        camera = self._rig.camera
-        in_force = camera.call(lambda c: c.configure(wanted), CALL_S, session)
-        self._exposure_s = (in_force.exposure_us or 0.0) * 1e-6
-        return {
-            **{name: value for name, value in asdict(in_force).items() if value is not None},
-            "pixel_format": camera.device.info().pixel_format.value,
-        }
-
-    def _same_devices(self, before: Mapping[str, Any]) -> None:
-        """An interrupted run goes on with the devices that it began with, or not at all."""
-        for name, now in self._rig.snapshot().items():
-            then = before.get(name)
-            if then is None or (then["model"], then["serial"]) != (now["model"], now["serial"]):
-                raise UmbraError(
-                    Code.UNSUITABLE,
-                    f"{self.folder.id} cannot be resumed: its {name} was "
-                    f"{then and then['model']} {then and then['serial']}, "
-                    f"now it is {now['model']} {now['serial']}; scan again",
-                )
-
-    def _room(self, planned: int | None, info: CameraInfo) -> None:
-        need = estimate_bytes(
-            info.shape, info.pixel_format.dtype, planned or 1, self._config.storage.keep_frames
-        )
-        if not self._store.room_for(need):
-            raise UmbraError(
-                Code.STORAGE_FULL,
-                f"{self._config.rig.data}: the scan needs about {need / 1e6:.0f} MB beyond the "
-                f"reserve, {self._store.free_bytes() / 1e6:.0f} MB are free: delete old runs",
-            )
+    def _choose(self, bench: Bench, resuming: bool) -> Choice:
+        """How exposures are kept in step with patterns. Raises Unsuitable."""
+        file = self.folder.file
+        if resuming and file.sequencing is not None:
+            self._exposed.update(file.sequencing["counts"])
+        choice = choose(file.spec, self._config.sequencer, bench, self._exposure_s * 1e6)
+        log.info("mode", mode=choice.mode, why=choice.why)
+        for warning in choice.warnings:
+            log.warning("exposure", problem=warning)
+        return choice
 
     def _ring(self, choice: Choice, bench: Bench, planned: int | None) -> Ring:
         """The ring: of a sequence all frames are kept until it is known to be in step, and the one
@@ -329,6 +315,28 @@ class Course:
             wanted = 2 * min(limits.images, planned or limits.images)
             count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
         return Ring(count, info.shape, info.pixel_format.dtype)
+
+    def _alive(self) -> None:
+        self.beat = time.monotonic()
+
+    def _wait(self, waits: Waiting) -> None:
+        """The run waits for something before its first frame: said at each look."""
+        self.beat = time.monotonic()
+        self._waits = waits
+        if self.folder.file.state is not RunState.WAITING:
+            self._note(RunState.WAITING)
+        self._say(f"waiting for {waits.what}: {waits.seen}")
+
+    def _note(self, state: RunState) -> None:
+        """Another state, which a full disk must not keep the run from: it is written later
+        (`Runner.tend`)."""
+        try:
+            self._update(state=state)
+        except StorageError as error:
+            if error.code is not Code.STORAGE_FULL:
+                raise
+            self.folder.remember(state=state)
+            self._on_change()
 
     def _frames(self, info: CameraInfo, resuming: bool) -> FrameStore:
         if resuming and (self.folder.path / "frames.jsonl").exists():
@@ -384,10 +392,13 @@ class Course:
     def _may_go_on(self) -> None:
         """Called at each step: a sign of life, and a pause before the disk is full."""
         self.beat = time.monotonic()
+        if self.folder.file.state is RunState.PAUSED and not self.control.paused:
+            self._update(state=RunState.RUNNING)  # it was resumed while it was being paused
         if self.beat - self._room_seen < _ROOM_S:
             return
         self._room_seen = self.beat
         if not self.control.paused and not self._store.room_for(0):
+            self._for_room = True
             self.control.pause(
                 f"only {self._store.free_bytes() / 1e6:.0f} MB are free in "
                 f"{self._config.rig.data}, less than the reserve: free some, then `umbra resume`"
@@ -395,17 +406,37 @@ class Course:
 
     def _paused(self, reason: str) -> None:
         """The sequencer has stopped at a checkpoint; comes back when it may go on."""
-        log.info("paused", reason=reason)
+        if self.folder.file.state is not RunState.PAUSED:
+            log.info("paused", reason=reason)
         self._say(f"paused: {reason}" if reason else "paused")
-        self._update(state=RunState.PAUSED)
+        self._note(RunState.PAUSED)
+
+    def _disk_full(self, error: StorageError) -> None:
+        """The disk took no more, reserve or not (recorder's thread): a pause, in which the frame
+        keeps its buffer. Comes back to write it again; raises the error when the run ends."""
+        if self.control.verdict is None:
+            reason = f"{error.message.partition(';')[0]}; free some, then `umbra resume`"
+            self._for_room = True
+            self.control.pause(reason)
+            # The sequencer says so too when it gets there, which it may not after the last frame.
+            self._paused(reason)
+        if not self.control.await_resume():
+            raise error
 
     def resumed(self) -> None:
-        """The pause is over."""
-        self.control.resume()
+        """The pause is over. Raises UmbraError(storage_full) if there is still no room."""
+        if self._for_room and not self._store.room_for(0):
+            raise UmbraError(
+                Code.STORAGE_FULL,
+                f"only {self._store.free_bytes() / 1e6:.0f} MB are free in "
+                f"{self._config.rig.data}, less than the reserve: free some, then `umbra resume`",
+            )
+        self._for_room = False
         if self.folder.file.state is RunState.PAUSED:
             self._moments.clear()
             self._update(state=RunState.RUNNING)
             self._say("scanning")
+        self.control.resume()
 
     def _taken(self, tally: Tally, summary: Mapping[str, float], exposed: Exposed) -> None:
         """The estimator has taken a frame in (separator's thread)."""
@@ -443,7 +474,7 @@ class Course:
         self._update(state=RunState.FINISHING)
         self._say("writing products")
         began = time.monotonic()
-        result = recorder.result(_RESULT_S)
+        result = self._with_exposure(recorder.result(_RESULT_S))
         self._timings["separate_s"] = time.monotonic() - began
         lost = recorder.lost_patterns
         made = products.write(
@@ -466,6 +497,16 @@ class Course:
                 "the products are made without them",
             )
         return End(state=RunState.DONE, reason=self._reason)
+
+    def _with_exposure(self, result: Result) -> Result:
+        """The result's facts with the exposure that was chosen, and its problem as advice."""
+        chosen = self.folder.file.rig.get("exposure")
+        if not chosen:
+            return result
+        facts = {**result.facts, "exposure": chosen}
+        if problem := chosen.get("problem"):
+            facts["advice"] = [f"Auto-exposure: {problem}.", *facts.get("advice", ())]
+        return replace(result, facts=facts)
 
     def _close(self, end: End) -> None:
         try:

@@ -83,6 +83,7 @@ class DeviceThread(Generic[D]):
         self.device = device
         self._tasks: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
         self._beat = time.monotonic()
+        self._closed = False
         self._due: float | None = None  # when the call under way must have come back
         self._thread = threading.Thread(target=self._run, name=f"umbra-{device.name}", daemon=True)
         self._thread.start()
@@ -134,8 +135,14 @@ class DeviceThread(Generic[D]):
             and (self._due is not None or late < 20 * _IDLE_BEAT_S)
         )
 
+    @property
+    def ended(self) -> bool:
+        """Whether it was closed: nothing that is submitted will be done."""
+        return self._closed
+
     def close(self, deadline_s: float) -> bool:
         """End the thread after what is queued; False when it does not come back in time."""
+        self._closed = True
         self._tasks.put(None)
         self._thread.join(deadline_s)
         return not self._thread.is_alive()

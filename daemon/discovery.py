@@ -23,6 +23,9 @@ from drivers.base import Device, DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages import DeviceInfo, Found, Search
 
+_START_S = 60.0
+_ASKED = b"\n"  # what the process says first, when the driver is about to be asked
+
 KINDS = ("camera", "projector", "stage", "light")
 
 log = structlog.get_logger(__name__)
@@ -75,7 +78,11 @@ async def _ask(kind: str, driver: str, timeout_s: float) -> _Answer:
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
     )
+    assert process.stdout is not None
     try:
+        # Thirteen Pythons at once start slowly on a small or busy machine: the driver's time is its
+        # library's, and begins when it is asked.
+        await asyncio.wait_for(process.stdout.read(1), _START_S)
         said, complaint = await asyncio.wait_for(process.communicate(), timeout_s)
     except TimeoutError:
         return _Answer(problem=f"it had found nothing after {timeout_s:g} s, and was ended")
@@ -175,6 +182,7 @@ def main(kind: str, driver: str) -> None:
     """Look, and say it on what was standard output; libraries that print go to standard error."""
     answer = os.dup(1)
     os.dup2(2, 1)
+    os.write(answer, _ASKED)
     os.write(answer, msgspec.json.encode(_look(kind, driver)))
     os.close(answer)
 

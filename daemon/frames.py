@@ -186,6 +186,11 @@ class FrameStore:
             self._lines.close()
             self._lines = None
 
+    @property
+    def writable(self) -> bool:
+        """Whether `append` and `commit` may be repeated: no fsync has failed."""
+        return self._lines is not None and self._lines.writable
+
     # ------------------------------------------------------------ reading
 
     def __len__(self) -> int:
@@ -393,11 +398,11 @@ def _crc32c(data: bytes) -> int:
 
 
 def count(folder: Path) -> tuple[int, int]:
-    """Frames recorded and missing in a run's folder, for what a crash left; (0, 0) if unreadable:
-    `FrameStore.open` says what is wrong."""
+    """Frames recorded and missing in a run's folder, for what a crash left; (0, 0) if there are
+    none yet, or unreadable: `FrameStore.open` says what is wrong."""
     try:
         records = journal.read(folder / LINES, FrameRecord)
-    except (Damaged, OSError):
+    except UmbraError:
         return 0, 0
     missing = sum(bool(record.missing) for record in records)
     return len(records) - missing, missing

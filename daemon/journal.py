@@ -63,6 +63,11 @@ class Journal:
         self._size += len(self._pending)
         self._pending.clear()
 
+    @property
+    def writable(self) -> bool:
+        """Whether it is open, and no write has left it in doubt."""
+        return self._file >= 0
+
     def close(self) -> None:
         """Let go of the file; what was not committed is forgotten. Idempotent."""
         if self._file >= 0:

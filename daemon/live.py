@@ -150,7 +150,12 @@ class Live:
             if triggered:
                 device.trigger()
             out = np.zeros(info.shape, info.pixel_format.dtype)
-            return device.grab(out, exposure_s + info.readout_s + _PATIENCE_S), info
+            asked_ns = device.clock.now_ns()
+            while True:
+                frame = device.grab(out, exposure_s + info.readout_s + _PATIENCE_S)
+                # One that streams faster than it is looked at has its buffers full of the past.
+                if triggered or info.recorded or frame.end_ns >= asked_ns:
+                    return frame, info
 
         return camera.call(take, exposure_s + _PATIENCE_S + _CALL_S, session)
 

@@ -6,32 +6,37 @@ lease, a lock has a heartbeat; when either is over, the rig goes to its safe sta
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
 import structlog
 
 from daemon.devicethread import Session
 from daemon.exposing.apparatus import CALL_S, SHOW_S
+from daemon.lightmeter import LONGEST_US, limits_of
 from daemon.live import Live
 from daemon.manualstage import ManualStage
+from daemon.metering import Exposure, Level, choose, level_of
 from daemon.patterns import render
 from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench
 from daemon.scans.single_image import SingleImageMethod
+from daemon.separation.radiometry import Response
+from daemon.snapshot import snap
 from daemon.viewfinder import Viewfinder
-from drivers.base import Acquisition, Camera, CameraInfo, CameraSettings, DeviceError, Frame
+from drivers.base import Camera, CameraInfo, CameraSettings, DeviceError, Frame
 from protocol.errors import Code, UmbraError
 from protocol.messages import AnyEvent, LockInfo
 from protocol.patterns import AnyPattern, Stripes
 from protocol.scans import SingleImage
 
 _FRAME_S = 2.0
+_EXPOSE_S = 120.0
 _LIGHT_S = 600.0
 """How long a light that was switched on by hand stays on when nobody asks again."""
 OWNER = "manual work"
@@ -190,6 +195,15 @@ class Manual:
 
     # ------------------------------------------------------------ acts
 
+    @contextlib.contextmanager
+    def _noticed(self) -> Iterator[None]:
+        """What a device says meanwhile counts for its health: a lost one is connected again."""
+        try:
+            yield
+        except DeviceError as error:
+            self._rig.failed(error)
+            raise
+
     def show(self, pattern: AnyPattern, lease_s: float) -> None:
         """Show a pattern until the lease is over. Raises UmbraError, DeviceError."""
         projector = self._rig.projector
@@ -202,7 +216,8 @@ class Manual:
             session = self.use(lease_s)
         info = projector.device.info()
         image = render(pattern, info.width, info.height)
-        projector.call(lambda p: p.show(image), SHOW_S, session)
+        with self._noticed():
+            projector.call(lambda p: p.show(image), SHOW_S, session)
 
     def look(
         self, rate_hz: float, lease_s: float, separate: SingleImage | None, bench: Bench | None
@@ -226,7 +241,8 @@ class Manual:
             known = ", ".join(self._rig.lights) or "none"
             raise UmbraError(Code.DEVICE_MISSING, f"no light {name!r}: this rig has {known}")
         session = self.use(_LIGHT_S if on else _FRAME_S)
-        thread.call(lambda light: light.set(on), CALL_S, session)
+        with self._noticed():
+            thread.call(lambda light: light.set(on), CALL_S, session)
 
     def snap(self) -> tuple[Frame, CameraInfo]:
         """Take one frame as things are. Raises UmbraError, DeviceError."""
@@ -234,30 +250,39 @@ class Manual:
         was_active = self.active
         session = self.use(_FRAME_S)
 
-        def take(cam: Camera) -> tuple[Frame, CameraInfo]:
-            info = cam.info()
-            out = np.zeros(info.shape, info.pixel_format.dtype)
-            cam.stop()  # a live view may have left it acquiring
-            cam.start(Acquisition.SOFTWARE)
-            try:
-                cam.trigger()
-                exposure_s = (cam.settings().exposure_us or 0.0) * 1e-6
-                return cam.grab(out, exposure_s + info.readout_s + _FRAME_S), info
-            finally:
-                cam.stop()
+        try:
+            with self._noticed(), self.live.aside():
+                frame, info = snap(camera, session, self._rig.clock)
+        finally:
+            if not was_active:
+                self.end()
+        self._viewfinder.offer(frame, info, now=True)
+        return frame, info
 
-        exposure_s = (camera.device.settings().exposure_us or 0.0) * 1e-6
+    def expose(self, wanted: CameraSettings, response: Response) -> Exposure:
+        """Choose the exposure for the scene as it is lit now; that of `wanted` is the longest, the
+        rest is set. See `daemon.metering.choose`. Raises UmbraError, DeviceError."""
+        camera = self._rig.camera
+        start = camera.device.settings().exposure_us or LONGEST_US / 100
+        was_active = self.active
+        session = self.use(_EXPOSE_S)
+
+        def look(exposure_us: float) -> Level:
+            frame, info = snap(
+                camera, session, self._rig.clock, replace(wanted, exposure_us=exposure_us)
+            )
+            self._viewfinder.offer(frame, info, now=True)
+            return level_of(frame.pixels, response, frame.exposure_us or exposure_us)
+
         try:
             with self.live.aside():
-                frame, info = camera.call(take, exposure_s + 2 * CALL_S, session)
+                return choose(look, start, limits_of(self._rig, wanted.exposure_us))
         except DeviceError as error:
             self._rig.failed(error)
             raise
         finally:
             if not was_active:
                 self.end()
-        self._viewfinder.offer(frame, info, now=True)
-        return frame, info
 
     def configure(self, wanted: CameraSettings) -> CameraSettings:
         """Change camera settings; gives those in force. Raises UmbraError, DeviceError."""
@@ -272,7 +297,7 @@ class Manual:
             return device.configure(wanted)
 
         try:
-            with self.live.aside():
+            with self._noticed(), self.live.aside():
                 return camera.call(set_camera, CALL_S, session)
         finally:
             if not was_active:

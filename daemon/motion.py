@@ -18,7 +18,7 @@ import structlog
 
 from daemon.devicethread import DeviceThread, Revoked, Session
 from daemon.scans.method import Circle, Motion
-from drivers.base import DeviceError, DeviceRefused, Stage, StageState
+from drivers.base import DeviceError, DeviceRefused, Stage, StageState, StageStatus
 
 CALL_S = 5.0
 """Deadline of a call that does not wait for the motion's end."""
@@ -32,6 +32,38 @@ _Leg = Callable[[Stage], None]
 _Legs = Iterator[_Leg]
 
 log = structlog.get_logger(__name__)
+
+
+def require_homed(
+    stage: DeviceThread[Stage], session: Session, beat: Callable[[], None]
+) -> StageStatus:
+    """Home the stage if its position is not known; its status. `beat` is called meanwhile.
+
+    Raises DeviceRefused for a stage in alarm: somebody must look first. Not repeated: what a
+    stage refuses once it refuses again.
+    """
+    status = stage.call(lambda s: s.status(), CALL_S, session)
+    if status.state is StageState.ALARM:
+        raise DeviceRefused(
+            stage.device.name,
+            "scan",
+            f"it is in alarm: {status.detail}" if status.detail else "it is in alarm",
+            "look at it, then `umbra stage unlock` and `umbra stage home`",
+        )
+    known = status.state not in {StageState.UNKNOWN, StageState.HOMING}
+    if known and status.position_mm is not None:
+        return status
+    log.info("the stage is homed first")
+    homing = stage.submit(lambda s: s.home(HOME_S), HOME_S + CALL_S, session)
+    while True:
+        beat()
+        try:
+            homing.result(_BEAT_S)
+        except FutureTimeout:
+            if homing.done():
+                raise
+        else:
+            return stage.call(lambda s: s.status(), CALL_S, session)
 
 
 class Mover:
@@ -68,17 +100,8 @@ class Mover:
         Raises DeviceRefused for a stage in alarm: somebody must look first. Not repeated: what a
         stage refuses once it refuses again.
         """
-        status = self._stage.call(lambda s: s.status(), CALL_S, self._session)
-        if status.state is StageState.ALARM:
-            raise DeviceRefused(
-                self._stage.device.name,
-                "scan",
-                f"it is in alarm: {status.detail}" if status.detail else "it is in alarm",
-                "look at it, then `umbra stage unlock` and `umbra stage home`",
-            )
-        if status.state in {StageState.UNKNOWN, StageState.HOMING} or status.position_mm is None:
-            self._home()
-        elif status.state is not StageState.IDLE:
+        status = require_homed(self._stage, self._session, self._beat)
+        if status.state is not StageState.IDLE:
             self._stage.call(lambda s: s.stop(), CALL_S, self._session)
         self._approach()
         legs = self._legs()
@@ -111,19 +134,6 @@ class Mover:
         return self._stage.device.position_at(at_ns)
 
     # ------------------------------------------------------------ the stage's side
-
-    def _home(self) -> None:
-        log.info("the stage is homed first")
-        homing = self._stage.submit(lambda s: s.home(HOME_S), HOME_S + CALL_S, self._session)
-        while True:
-            self._beat()
-            try:
-                homing.result(_BEAT_S)
-            except FutureTimeout:
-                if homing.done():
-                    raise
-            else:
-                return
 
     def _approach(self) -> None:
         """To where the motion begins, as fast as the stage goes."""

@@ -2,7 +2,8 @@
 
 What a measurement leaves is in `daemon.measured`.
 
-    direct.tiff, global.tiff   float32, linear counts in the input's full scale, RGB; NaN: unknown
+    direct.tiff, global.tiff   float32, linear counts in the input's full scale, RGB; NaN: unknown;
+                               of a bracket, in counts of the run's exposure, and beyond
     PLANE.tiff                 further planes of the method
     truth_*.tiff               of a simulated camera
     quality.png                uint16 bits (`daemon.quality`), lossless
@@ -68,7 +69,9 @@ def write(
     if file.calibration:
         facts["calibration"] = file.calibration
     tone = file.spec.radiometry.tone if isinstance(file.spec, Scan) else "linear"
-    white = min(common_white(_sum(components)), full_scale)
+    # the exposures of a bracket reach beyond one frame's full scale
+    scale = max(full_scale, facts.get("exposure_histogram", {}).get("to", 0.0))
+    white = min(common_white(_sum(components)), scale)
     shown = _frame_light(folder.path, records, pixel_format, tone)
     pictures = {
         "frame": frame if shown is None else for_display(shown, white),
@@ -215,11 +218,12 @@ def _records(folder: Path) -> list[FrameRecord]:
 def _frame_light(
     folder: Path, records: list[FrameRecord], pixel_format: PixelFormat | None, tone: str
 ) -> NDArray[np.float32] | None:
-    """The frame to be shown: the white one if there is, else the first of the patterns."""
+    """The frame to be shown: the white one if there is, else the first of the patterns; of a
+    bracket the one that was exposed most like the run's own exposure."""
     wanted = [
         r
         for lighting in (Lighting.WHITE, Lighting.PATTERN)
-        for r in records
+        for r in sorted(records, key=lambda r: abs(np.log(r.observation.exposure)))
         if r.observation.lighting is lighting and r.observation.used and not r.missing
     ]
     if pixel_format is None or not wanted:
@@ -228,7 +232,8 @@ def _frame_light(
         pixels = FrameStore.open(folder, readonly=True).read(wanted[0].index)
     except (NoPixels, Damaged):  # the products must not depend on one frame's file
         return None
-    return frame_light(pixels, pixel_format, REPORT_WIDTH, tone)
+    light = frame_light(pixels, pixel_format, REPORT_WIDTH, tone)
+    return light * np.float32(1.0 / wanted[0].observation.exposure)
 
 
 def _sum(components: Components) -> NDArray[np.float32]:

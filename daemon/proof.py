@@ -13,6 +13,9 @@ projector:
   family have shown: one that is as good as equal to the frame before shows the pattern before, and
   one of which only the upper or the lower rows are so is *torn*: it holds two patterns.
 
+Frames are compared with others of their exposure time; one of which much is saturated shows too
+little of its pattern to be judged (of a bracket, shorter exposures of the same light are).
+
 Pure: no I/O, no threads. Only a sample of each frame is kept, so that it costs little.
 """
 
@@ -34,6 +37,7 @@ from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting
 
 _SAMPLES = 20_000
+_BLIND = 0.4  # of the samples saturated: from here a frame is not judged
 _BRIGHTER = 5.0  # standard errors: by how much white must be brighter than black, at least
 _OFF_LEVEL = 0.4  # of the way from black to white: how far a pattern's brightness may be off
 _SAME = 0.35  # of the difference that two patterns should make: below it they are one
@@ -117,7 +121,35 @@ class _Scale:
 
 
 class Proof:
-    """Judges frame after frame of one scan; a frame that failed is forgotten, not compared with."""
+    """Judges frame after frame of one scan; a frame that failed is forgotten, not compared with.
+
+    `full_scale` is the count of a saturated sample.
+    """
+
+    def __init__(self, full_scale: float = math.inf) -> None:
+        self._full_scale = full_scale
+        self._exposures: dict[float | None, _Looks] = {}
+
+    def fork(self) -> Proof:
+        """A copy that goes its own way: for frames of which it is not yet known whether they
+        count."""
+        forked = Proof(self._full_scale)
+        forked._exposures = {key: looks.fork() for key, looks in self._exposures.items()}
+        return forked
+
+    def problem(self, pixels: NDArray[Any], step: Expose, look: Look | None) -> str:
+        """Why the frame (H, W) or (H, W, 3) cannot be of this step; "" if it can.
+
+        `look` is the `look_of` what the projector was given.
+        """
+        sample = _sample(pixels)
+        if _blind(sample, self._full_scale):
+            return ""
+        return self._exposures.setdefault(step.exposure_us, _Looks()).problem(sample, step, look)
+
+
+class _Looks:
+    """The frames of one exposure time."""
 
     def __init__(self) -> None:
         self._black: Sample | None = None
@@ -128,19 +160,14 @@ class Proof:
         #: of the pairs so far: what each band's difference was of the images' own
         self._gains: deque[Bands] = deque(maxlen=16)
 
-    def fork(self) -> Proof:
-        """A copy that goes its own way: for frames of which it is not yet known whether they
-        count."""
+    def fork(self) -> _Looks:
+        """See `Proof`."""
         forked = copy.copy(self)
         forked._gains = self._gains.copy()
         return forked
 
-    def problem(self, pixels: NDArray[Any], step: Expose, look: Look | None) -> str:
-        """Why the frame (H, W) or (H, W, 3) cannot be of this step; "" if it can.
-
-        `look` is the `look_of` what the projector was given.
-        """
-        sample = _sample(pixels)
+    def problem(self, sample: Sample, step: Expose, look: Look | None) -> str:
+        """See `Proof`."""
         found = self._problem(sample, step, look)
         if not found:
             self._remember(sample, step, look)
@@ -173,8 +200,8 @@ class Proof:
         if not look.even_rows:
             return ""
         off = [
-            abs((mean - black) / more - look.level) > _OFF_LEVEL if spread else None
-            for mean, black, more, spread in zip(means, scale.black, lit, scale.spread, strict=True)
+            abs((its - black) / more - look.level) > _OFF_LEVEL if spread else None
+            for its, black, more, spread in zip(means, scale.black, lit, scale.spread, strict=True)
         ]
         return _torn(off, "has not the light of its pattern")
 
@@ -219,11 +246,18 @@ class Proof:
         self._last = (step, sample, look)
 
 
-def head_problem(white: NDArray[Any], black: NDArray[Any]) -> str:
+def head_problem(white: NDArray[Any], black: NDArray[Any], full_scale: float = math.inf) -> str:
     """Why two frames cannot be the white and the black image at the head of a sequence, or ""."""
-    if found := _of_white(_sample(white), _sample(black)):
+    first, second = _sample(white), _sample(black)
+    if _blind(second, full_scale):
+        return ""
+    if found := _of_white(first, second):
         return f"the light is not in step with the triggers: {found}"
     return ""
+
+
+def _blind(sample: Sample, full_scale: float) -> bool:
+    return float(np.mean(sample >= full_scale)) > _BLIND
 
 
 def _of_white(white: Sample, black: Sample) -> str:

@@ -39,7 +39,8 @@ class Bit:
 BITS: tuple[Bit, ...] = (
     Bit(
         Quality.LOW_MODULATION,
-        "Direct light is not told from noise here.",
+        "Direct light is not told from noise here, or (two images) is too small, at the edge of a "
+        "checker.",
         "Natural in shadow and in pure interreflection. Elsewhere: average more frames, expose "
         "longer, or focus the projector.",
         (86, 180, 233),
@@ -70,8 +71,8 @@ BITS: tuple[Bit, ...] = (
     ),
     Bit(
         Quality.RESIDUE,
-        "The pattern shows in a component: mirrors and glass, or a blurred projector.",
-        "Don't trust it on mirror-like surfaces. Elsewhere: focus, or use larger checkers.",
+        "The pattern came by way of a mirror or of glass: reversed, finer or bent.",
+        "Don't trust it there: what is reflected counts as direct. Cover or powder the mirror.",
         (255, 221, 64),
     ),
     Bit(

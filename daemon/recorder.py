@@ -5,6 +5,9 @@ Two workers in a row, each with a bounded queue: the *recorder* decides what a f
 estimator and gives the buffer back to the ring. The estimator never sees a frame that the
 recorder has not accepted, so replaying the records gives the same bits.
 
+A full disk ends nothing: the frame keeps its buffer, `on_full` waits for room, and it is written
+again. Nothing of it was acknowledged.
+
 Hand-over policy: `put` waits while the queue is full. The ring is what bounds it: a stepped scan
 waits for a buffer, a video scan that finds none records a gap (see `daemon.sequencer`).
 """
@@ -19,16 +22,20 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, TypeVar
 
 import structlog
 
+from daemon.durable import StorageError
 from daemon.frames import FrameRecord, FrameStore
 from daemon.ring import Buffer, Ring
 from daemon.scans.method import Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, NotYet, Result
 from drivers.base import Frame
 from drivers.clock import NS
+from protocol.errors import Code
+
+R = TypeVar("R")
 
 _GROUP_FRAMES = 16
 _GROUP_S = 0.25
@@ -83,7 +90,9 @@ class Recorder:
     """The two workers of one run. Any failure of theirs is raised by the next call of `put`.
 
     `on_taken(tally, summary, exposed)` is called after the estimator took a frame in, from the
-    separator's thread; `exposed.frame.pixels` may be looked at only within the call.
+    separator's thread; `exposed.frame.pixels` may be looked at only within the call. `on_full` is
+    called by the recorder's thread when the disk is full: it comes back when there may be room, or
+    raises.
     """
 
     def __init__(
@@ -92,11 +101,13 @@ class Recorder:
         frames: FrameStore,
         ring: Ring,
         on_taken: Callable[[Tally, Mapping[str, float], Exposed], None],
+        on_full: Callable[[StorageError], None],
     ) -> None:
         self._method = method
         self._frames = frames
         self._ring = ring
         self._on_taken = on_taken
+        self._on_full = on_full
         self._estimator = method.estimator()
         self._failure: BaseException | None = None
         self._summary: Mapping[str, float] = {}
@@ -296,12 +307,23 @@ class Recorder:
         )
         if frame is None:
             return self._frames.append_missing(record)
-        return self._frames.append(frame.pixels, record)
+        return self._when_there_is_room(lambda: self._frames.append(frame.pixels, record))
+
+    def _when_there_is_room(self, write: Callable[[], R]) -> R:
+        """Write; on a full disk again and again. Any other failure is raised, and so is a full disk
+        that was found out by an fsync: what it has dropped must be read back, and is not here."""
+        while True:
+            try:
+                return write()
+            except StorageError as error:
+                if error.code is not Code.STORAGE_FULL or not self._frames.writable:
+                    raise
+                self._on_full(error)
 
     def _commit(self, waiting: list[tuple[Exposed, FrameRecord]]) -> None:
         if not waiting:
             return
-        self._frames.commit()
+        self._when_there_is_room(self._frames.commit)
         for item in waiting:
             self._hand_over(item)
         waiting.clear()

@@ -22,6 +22,7 @@ from daemon.quality import BITS, Bit
 from daemon.separation.finish import ADVICE
 from daemon.store import RunFile
 from protocol.messages import Product
+from protocol.scans import PatternScan
 
 _ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a line of advice
 _DIM_BELOW = 0.25  # of full scale: a scene that uses less than this is under-exposed
@@ -117,7 +118,8 @@ def advice(subject: Subject) -> list[str]:
         if share >= _ADVISED_FROM and not (said and any(said in line for line in lines)):
             lines.append(f"{_percent(share)} of the pixels: {_lower(bit.meaning)} {bit.remedy}")
     top = subject.white / subject.full_scale
-    if top < _DIM_BELOW and _share(facts, "saturated") < _ADVISED_FROM:
+    bracketed = isinstance(file.spec, PatternScan) and file.spec.bracket is not None
+    if top < _DIM_BELOW and not bracketed and _share(facts, "saturated") < _ADVISED_FROM:
         lines.append(
             f"The scene uses {_percent(top)} of the camera's scale: "
             f"an exposure about {0.8 / top:.0f} times as long would lower the noise."
@@ -284,7 +286,8 @@ def _settings(subject: Subject) -> Iterable[tuple[str, Any]]:
     first = next((r for r in subject.records if not r.missing), None)
     if first:
         if first.exposure_us:
-            yield "exposure", f"{first.exposure_us / 1e3:.4g} ms"
+            own_us = first.exposure_us / first.observation.exposure
+            yield "exposure", f"{own_us / 1e3:.4g} ms"
         yield "gain", f"{first.gain:g}"
     for key in ("estimator", "lit_fraction", "leakage", "black_level", "tone", "full_scale"):
         if key in subject.facts:
@@ -328,8 +331,12 @@ def calibration(file: RunFile) -> str:
 def calibration_advice(file: RunFile) -> list[str]:
     """A line for each calibration that could not be applied."""
     return [
-        f"The {one['kind']} calibration {one['run']} was not applied: {one['why']}; "
-        f"run `umbra calibrate {one['kind']}`."
+        (
+            f"The {one['kind']} calibration {one['run']} was not applied: {one['why']}"
+            if one["run"]
+            else f"The {one['kind']} was {one['why']}"
+        )
+        + f"; run `umbra calibrate {one['kind']}`."
         for one in (file.calibration or {}).get("ignored", ())
     ]
 

@@ -141,12 +141,14 @@ class Rig:
         """
         self.require_ready()
         projector, stage = self.projector, self.stage
+        settings = self.camera.device.settings()
         return Bench(
             camera=self.camera.device.info(),
             projector=projector.device.info() if projector else None,
             stage=stage.device.info() if stage else None,
             lights=tuple(self.lights),
-            exposure_us=self.camera.device.settings().exposure_us,
+            exposure_us=settings.exposure_us,
+            gain=settings.gain,
             calibration=calibration,
         )
 
@@ -314,7 +316,9 @@ class Rig:
         # The projector first: light is what a person in front of it notices.
         members = sorted(self._members.values(), key=lambda m: m.device.kind != "projector")
         return [
-            m.thread.submit(lambda d: d.safe(), SAFE_S) for m in members if m.identity is not None
+            m.thread.submit(lambda d: d.safe(), SAFE_S)
+            for m in members
+            if m.identity is not None and not m.thread.ended  # closed: it was made safe before
         ]
 
     def safe_within(self, futures: list[Future[None]], seconds: float) -> bool:

@@ -18,6 +18,7 @@ from daemon.course import Course, utc_now
 from daemon.exposing.modes import choose
 from daemon.failures import as_error
 from daemon.frames import count
+from daemon.lightmeter import require_meterable
 from daemon.rig import Rig
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Unsuitable
@@ -36,7 +37,7 @@ from protocol.messages import (
 )
 from protocol.scans import AnyScan
 
-_UNFINISHED = {RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}
+_UNFINISHED = {RunState.WAITING, RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}
 _RESUMABLE_CODES = {
     Code.DEVICE_LOST,
     Code.DEVICE_TIMEOUT,
@@ -44,6 +45,7 @@ _RESUMABLE_CODES = {
     Code.DEVICE_GARBLED,
     Code.STORAGE_FULL,
     Code.STORAGE_FAILED,
+    Code.NOT_READY,
 }
 
 LOCK = "lock"
@@ -81,6 +83,7 @@ class Runner:
         self._choosing = threading.Lock()  # a run is begun or taken from the queue, never both
         self._held: set[str] = set()
         self._of_holder: set[str] = set()  # runs submitted by whoever holds the rig
+        self._unwritten: set[str] = set()  # runs whose state a full disk has refused
         self._stopping = False
 
     # ------------------------------------------------------------ the loop
@@ -103,13 +106,19 @@ class Runner:
         self.tend()
 
     def tend(self) -> None:
-        """Call now and then: write ends that a full disk refused. Blocks for an fsync if so."""
+        """Call now and then: write states that a full disk refused. Blocks for an fsync if so."""
         for run in self._store.runs():
             if run.unwritten:
                 try:
                     run.flush()
                 except UmbraError as error:
-                    log.warning("a run's end is still not written", run=run.id, error=error.message)
+                    if run.id not in self._unwritten:
+                        log.warning(
+                            "a run's state is not written yet", run=run.id, error=str(error)
+                        )
+                    self._unwritten.add(run.id)
+                else:
+                    self._unwritten.discard(run.id)
 
     async def serve(self) -> None:
         """Run what is queued until `stop`."""
@@ -124,7 +133,10 @@ class Runner:
             await self._run(course)
 
     def wake(self) -> None:
-        """Look again whether a run can begin; from any thread."""
+        """Look again whether a run can begin, or go on that waits; from any thread."""
+        course = self._course
+        if course is not None:
+            course.control.news.set()
         if self._loop is not None:
             self._loop.call_soon_threadsafe(self._wake.set)
 
@@ -150,10 +162,15 @@ class Runner:
             store=self._store,
             config=self._config,
             viewfinder=self._viewfinder,
-            on_change=lambda: self._publish(RunChanged(run=run.info())),
+            on_change=lambda: self._changed(run),
             on_progress=lambda p: self._publish(Progressed(progress=p)),
         )
         return self._course
+
+    def _changed(self, run: RunFolder) -> None:
+        """The run under way has another state, and the rig with it."""
+        self._publish(RunChanged(run=run.info()))
+        self._on_activity()
 
     def _next(self) -> RunFolder | None:
         if self._stopping or self._held - {LOCK}:
@@ -161,7 +178,9 @@ class Runner:
         waiting = self._store.queued()
         if LOCK in self._held:
             waiting = [run for run in waiting if run.id in self._of_holder]
-        if not waiting or not self._rig.ready:
+        if not waiting:
+            return None
+        if not self._rig.ready and not waiting[0].file.spec.ready.deadline_s:
             return None  # a device that is away fails no run that has not begun
         return waiting[0]
 
@@ -280,13 +299,15 @@ class Runner:
         """
         if (known := self._store.find_request(request_id)) is not None:
             return known
-        try:
-            bench = self._rig.bench()
-            method_for(spec, bench)
-            exposure_us = spec.exposure_us or bench.exposure_us or 0.0
-            choose(spec, self._config.sequencer, bench, exposure_us)
-        except Unsuitable as error:
-            raise as_error(error) from error
+        if self._rig.ready or not spec.ready.deadline_s:  # else it is looked at when they are there
+            try:
+                bench = self._rig.bench()
+                method_for(spec, bench)
+                require_meterable(spec, bench)
+                exposure_us = spec.exposure_us or bench.exposure_us or 0.0
+                choose(spec, self._config.sequencer, bench, exposure_us)
+            except Unsuitable as error:
+                raise as_error(error) from error
         run = self._store.create(
             spec, self._rig.snapshot(), by=by, request_id=request_id, first=first
         )

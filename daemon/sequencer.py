@@ -9,9 +9,6 @@ camera is stopped, and its exposure is as it was before.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from daemon.control import Control
 from daemon.exposing.apparatus import RING_S, Apparatus
 from daemon.exposing.exposer import Behind, Exposer
 from daemon.exposing.modes import Choice, Mode
@@ -19,12 +16,11 @@ from daemon.exposing.sequences import Sequences
 from daemon.exposing.stepped import Stepped
 from daemon.exposing.streamed import Streamed
 from daemon.exposing.video import Video
-from daemon.rig import SAFE_S
 from daemon.scans.method import Digest, Expose, Watch
 from drivers.base import DeviceError
 
 
-def exposer_for(choice: Choice, apparatus: Apparatus, control: Control) -> Exposer:
+def exposer_for(choice: Choice, apparatus: Apparatus) -> Exposer:
     """The way of exposing that a choice names."""
     triggers = apparatus.info.triggers
     if choice.mode is Mode.FREE:
@@ -36,25 +32,16 @@ def exposer_for(choice: Choice, apparatus: Apparatus, control: Control) -> Expos
         single = Stepped(apparatus)
     elif "none" in triggers:
         single = Streamed(apparatus)
-    return Sequences(apparatus, control, single, strict=choice.strict)
+    return Sequences(apparatus, single, strict=choice.strict)
 
 
 class Sequencer:
     """One scan in its course, in the thread that calls `run`."""
 
-    def __init__(
-        self,
-        apparatus: Apparatus,
-        exposer: Exposer,
-        control: Control,
-        on_pause: Callable[[str], None],
-    ) -> None:
-        """`on_pause` is called with the reason when a pause begins."""
+    def __init__(self, apparatus: Apparatus, exposer: Exposer) -> None:
         self._its = apparatus
         self._exposer = exposer
-        self._control = control
-        self._on_pause = on_pause
-        self._video = Video(apparatus, control, self._paused)
+        self._video = Video(apparatus)
         self.reason = "all steps were exposed"
 
     def run(self, index: int, sub: int) -> None:
@@ -66,9 +53,9 @@ class Sequencer:
         try:
             while (step := its.method.step(index, its.recorder.summary)) is not None:
                 its.may_go_on()
-                if self._control.paused:
+                if its.control.paused:
                     self._exposer.settle()
-                self._control.checkpoint(its.session, self._paused)
+                its.checkpoint()
                 if isinstance(step, Expose):
                     index, sub = self._exposer.expose(index, step, sub)
                     continue
@@ -92,22 +79,12 @@ class Sequencer:
 
     def _digest(self) -> None:
         """Wait until the estimator knows every frame so far."""
-        if not self._its.recorder.digested(RING_S):
-            raise Behind
+        while not self._its.recorder.digested(RING_S):
+            if not self._its.control.paused:
+                raise Behind
+            self._its.checkpoint()  # the disk is full
 
     def _stop(self) -> None:
         if not self._its.session.ended.is_set():
             self._its.stop()
             self._its.set_exposure(None)
-
-    def _paused(self, reason: str) -> None:
-        """Dark and held for as long as the pause lasts."""
-        its = self._its
-        its.stop()
-        if its.projector is not None:
-            its.projector.call(lambda p: p.safe(), SAFE_S, its.session)
-        for light in its.rig.lights.values():
-            light.call(lambda x: x.safe(), SAFE_S, its.session)
-        if its.rig.stage is not None:
-            its.rig.stage.call(lambda s: s.safe(), SAFE_S, its.session)
-        self._on_pause(reason)

@@ -178,7 +178,7 @@ class Store:
         self.reserve_bytes = reserve_bytes
         self.damaged: dict[str, str] = {}  # folder -> what is wrong with it
         self._clock = clock or RealClock()
-        self._runs = data / "runs"
+        self._runs = self.runs_folder = data / "runs"
         self._known: dict[str, RunFolder] = {}
         self._lock = threading.RLock()
         self._creating = threading.Lock()

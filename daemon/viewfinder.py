@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -32,6 +32,7 @@ class Glimpse:
     facts: dict[str, Any]
     run: str
     what: str = "frame"  # frame, direct, global
+    at_s: float = field(default_factory=time.monotonic)  # when it was made
 
 
 class Viewfinder:
@@ -100,7 +101,7 @@ def cells(marked: NDArray[Any], height: int, width: int) -> NDArray[np.uint8]:
 def facts_of(frame: Frame, info: CameraInfo) -> dict[str, Any]:
     """Exposure, saturation and histogram of a frame, from a sample of its pixels."""
     full = info.pixel_format.full_scale
-    step = max(1, int((frame.pixels.size / 250_000) ** 0.5))
+    step = max(1, int((frame.pixels.size / 250_000) ** 0.5)) | 1  # odd: all colours of a mosaic
     sample = frame.pixels[::step, ::step]
     counts, _ = np.histogram(sample, bins=_HISTOGRAM_BINS, range=(0, full + 1))
     return {

@@ -3,8 +3,9 @@
 Needs Debian's `gir1.2-aravis-0.8` beside the extra. See drivers/streaming.py for states and retry
 policy. Aravis itself repeats a register access five times in 2.5 s, and others wait behind it: so
 before a call that must not hang the camera is asked for a sign of life, and one that does not
-answer within a second is DeviceLost. Letting go of a lost camera takes Aravis up to 12 s, spent in
-`close` or in the next `connect`.
+answer within a second is DeviceLost. Letting go of a lost camera takes Aravis up to 12 s, and there
+is no way to hurry it: that goes on in a thread of its own, and until it has ended `connect` is
+DeviceLost, because the old connection's end would take control away from the new one.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ except ValueError as error:  # the bindings are there, the library is not
 
 
 ALIVE_S = 1.0  # a camera answers within milliseconds
+LETTING_GO_S = 2.0  # so long `connect` waits for the end of a lost connection
 
 
 class AravisOptions(SfncOptions, frozen=True, kw_only=True):
@@ -84,6 +86,9 @@ class _AravisNodes(Nodes):
             return ()
         return tuple(self._device.dup_available_enumeration_feature_values_as_strings(name))
 
+    def code(self, name: str) -> int:
+        return int(self._device.get_integer_feature_value(name)) & 0xFFFFFFFF
+
     def execute(self, name: str) -> None:
         self._device.execute_command(name)
 
@@ -100,6 +105,8 @@ class AravisCamera(SfncCamera):
         self._stream: Any = None
         self._lost = threading.Event()
         self._asking: threading.Thread | None = None
+        self._streams: list[Any] = []  # of a lost camera: dropping one takes seconds, too
+        self._leaving: threading.Thread | None = None
 
     @classmethod
     def discover(cls) -> list[dict[str, Any]]:
@@ -127,6 +134,7 @@ class AravisCamera(SfncCamera):
     # ------------------------------------------------------------ what a driver adds
 
     def _attach(self) -> tuple[Nodes, Identity]:
+        self._until_gone()
         self._lost.clear()
         try:
             camera = Aravis.Camera.new(self._device_id())
@@ -204,6 +212,7 @@ class AravisCamera(SfncCamera):
             release=lambda: stream.push_buffer(buffer),
             stride=self._stride(buffer) if whole else None,
             incomplete=not whole,
+            pixel_code=int(buffer.get_image_pixel_format()) & 0xFFFFFFFF if whole else None,
         )
 
     def _stride(self, buffer: Any) -> int | None:
@@ -217,13 +226,40 @@ class AravisCamera(SfncCamera):
         stream, self._stream = self._stream, None  # its last reference ends its thread
         if stream is not None and self._answers():
             self._camera.stop_acquisition()
+        elif stream is not None:
+            self._streams.append(stream)
 
     def _release(self) -> None:
-        if self._asking is not None:
-            # What it holds must be gone before the camera is opened anew: the old connection's end
-            # would take control away from the new one.
-            self._asking.join()
-        self._asking = self._camera = self._nodes_or_none = self._stream = None
+        held = [self._asking, self._nodes_or_none, self._camera, self._stream, *self._streams]
+        self._asking = self._nodes_or_none = self._camera = self._stream = None
+        self._streams = []
+        if held[0] is None and not self._lost.is_set():
+            return  # `held` was all that there was, and ends here
+
+        def let_go() -> None:
+            if isinstance(asking := held[0], threading.Thread):
+                asking.join()  # it holds the camera, too
+            held.clear()
+
+        if any(held):
+            self._leaving = threading.Thread(target=let_go, name=f"{self.name}-leave", daemon=True)
+            self._leaving.start()
+            if not self._lost.is_set():
+                self._leaving.join()
+
+    def _until_gone(self) -> None:
+        """Wait for the end of the connection before."""
+        leaving = self._leaving
+        if leaving is not None:
+            leaving.join(LETTING_GO_S)
+            if leaving.is_alive():
+                raise DeviceLost(
+                    self.name,
+                    "connect",
+                    "the connection that was lost is still being closed",
+                    "connect again in a few seconds",
+                )
+        self._leaving = None
 
     def _ready(self) -> None:
         self._still_there("trigger")

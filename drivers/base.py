@@ -200,6 +200,8 @@ class CameraInfo:
     pixel_format: PixelFormat
     black_level: float = 0.0  # nominal counts in the dark
     exposure_range_us: tuple[float, float] = (1.0, 1e9)
+    gain_range: tuple[float, float] | None = None  # None: unknown, or it has none
+    gain_unit: str = ""  # "dB", "ISO"; "": the device's own
     max_rate_hz: float = 0.0  # frames a second at the present exposure; 0: unknown
     readout_s: float = 0.0  # from the end of the exposure to the frame being here
     rolling_s: float = 0.0  # how much later the last row is exposed than the first; 0: all at once

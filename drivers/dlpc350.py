@@ -437,7 +437,8 @@ def _mailbox(which: p.Mailbox, data: bytes) -> list[tuple[Command, bytes]]:
 def _display(name: str, options: Dlpc350Options, context: Context) -> DisplayProjector:
     """The HDMI side, at the DMD's own size: anything else would be scaled by the board."""
     try:
-        from drivers.display import DisplayOptions, DisplayProjector  # noqa: PLC0415 - an extra
+        from drivers.display import DisplayProjector  # noqa: PLC0415 - an extra
+        from drivers.displaywindow import DisplayOptions  # noqa: PLC0415
     except ImportError as error:
         raise UnknownDriver(
             f"{name}: dlpc350 with a `display` needs {error.name}, which is not installed: "

@@ -25,6 +25,10 @@ with warnings.catch_warnings():  # it changes the whole program's filters
     from harvesters.core import Callback, Harvester, ImageAcquirer
 
 PRODUCERS = "GENICAM_GENTL64_PATH"  # where vendors' installers say that their producers are
+NAMESPACES = {  # of pixel formats: those with the numbers that a camera's PixelFormat has
+    gentl.PIXELFORMAT_NAMESPACE_IDS.PIXELFORMAT_NAMESPACE_GEV,
+    gentl.PIXELFORMAT_NAMESPACE_IDS.PIXELFORMAT_NAMESPACE_PFNC_32BIT,
+}
 READABLE = 2  # access modes from here on: write only, read only, read and write
 
 
@@ -69,6 +73,9 @@ class _GenApiNodes(Nodes):
         if not isinstance(node, genapi.IEnumeration):
             return ()
         return tuple(e.symbolic for e in node.entries if e.get_access_mode() >= READABLE)
+
+    def code(self, name: str) -> int:
+        return int(self._map.get_node(name).get_int_value()) & 0xFFFFFFFF
 
     def execute(self, name: str) -> None:
         self._map.get_node(name).execute()
@@ -196,6 +203,7 @@ class GentlCamera(SfncCamera):
             device_ns=_timestamp_ns(raw),
             release=lambda: raw.parent.queue_buffer(raw),
             stride=layout.row_bytes(int(raw.width) * layout.samples) + padding if padding else None,
+            pixel_code=_pixel_code(raw),
         )
 
     def _end(self) -> None:
@@ -241,6 +249,16 @@ def _timestamp_ns(raw: Any) -> int:
         return int(raw.timestamp_ns)
     except gentl.GenericException:  # it has no clock, or does not say how fast it goes
         return 0
+
+
+def _pixel_code(raw: Any) -> int | None:
+    """The frame's own pixel format, where its producer counts formats as cameras do."""
+    try:
+        if int(raw.pixel_format_name_space) not in NAMESPACES:
+            return None
+        return int(raw.pixel_format) & 0xFFFFFFFF
+    except gentl.GenericException:  # it does not say
+        return None
 
 
 def _first_line(error: Exception) -> str:

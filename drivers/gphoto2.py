@@ -274,12 +274,15 @@ class GphotoCamera(Camera):
             raise self._refused(phase, f"its picture {error.problem}", error.remedy) from error
         name = self._config.first(SHUTTER)
         times = self._config.numbers(name).values() if name else ()
+        speeds = self._config.numbers(iso).values() if (iso := self._config.first(ISO)) else ()
         self._info = CameraInfo(
             width=pixels.shape[1],
             height=pixels.shape[0],
             pixel_format=pixel_format,
             black_level=black,
             exposure_range_us=(min(times) * 1e6, max(times) * 1e6) if times else (0.0, 0.0),
+            gain_range=(min(speeds), max(speeds)) if speeds else None,
+            gain_unit="ISO",
             triggers=("software", "hardware"),
         )
         self._settings = self._in_force()

@@ -60,6 +60,9 @@ class _PylonNodes(Nodes):
             return ()
         return tuple(str(entry) for entry in node.GetSettableValues())
 
+    def code(self, name: str) -> int:
+        return int(self._map.GetNode(name).GetIntValue()) & 0xFFFFFFFF
+
     def execute(self, name: str) -> None:
         self._map.GetNode(name).Execute()
 
@@ -148,6 +151,7 @@ class PylonCamera(SfncCamera):
             release=result.Release,
             stride=int(stride) if padding and aligned else None,
             incomplete=not result.GrabSucceeded(),
+            pixel_code=int(result.GetPixelType()) & 0xFFFFFFFF,
         )
 
     def _end(self) -> None:

@@ -211,8 +211,9 @@ class SerialPort:
             return first + bytes(port.read(port.in_waiting)) if first else b""
         except (OSError, TypeError, ValueError) as error:
             # pyserial shows a port that was closed or pulled under a read as any of these
+            why = "it hung up" if "returned no data" in str(error) else error
             raise DeviceLost(
-                self.device, "read", f"the line is dead ({error})", "check cable and power"
+                self.device, "read", f"the line is dead ({why})", "check cable and power"
             ) from error
 
     def write(self, data: bytes) -> None:
@@ -248,11 +249,17 @@ class SerialPort:
     def close(self) -> None:
         """Let go of the port; idempotent, does not raise for one that is gone."""
         port, self._serial, self.path = self._serial, None, ""
-        if port is not None:
-            try:
-                port.close()
-            except OSError:
-                return  # it is gone: there is nothing left to let go of
+        if port is None:
+            return
+        # pyserial leaves the socket of a connection that was reset open: its shutdown fails first
+        connection = getattr(port, "_socket", None)
+        try:
+            port.close()
+        except OSError:
+            pass  # it is gone: there is nothing left to let go of
+        finally:
+            if connection is not None:
+                connection.close()
 
 
 class LineReader:

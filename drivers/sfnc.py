@@ -10,10 +10,19 @@ from abc import ABC, abstractmethod
 from typing import Any, Literal
 
 import msgspec
+from numpy.typing import NDArray
 
-from drivers.base import Acquisition, CameraInfo, CameraSettings, Context, Identity
+from drivers.base import (
+    Acquisition,
+    CameraInfo,
+    CameraSettings,
+    Context,
+    DeviceGarbled,
+    Identity,
+    PixelFormat,
+)
 from drivers.clock import NS
-from drivers.streaming import StreamingCamera, StreamingOptions
+from drivers.streaming import Buffer, StreamingCamera, StreamingOptions
 from drivers.unpack import Layout, Packing, layout_of
 
 LATCH_EVERY_NS = 10 * NS  # clocks 50 ppm apart: 0.5 ms
@@ -23,6 +32,7 @@ Value = bool | int | float | str
 # Where a camera has both names, the old one is its own and the other an alias for new programs.
 EXPOSURE = ("ExposureTimeAbs", "ExposureTime")
 GAIN = ("GainAbs", "Gain", "GainRaw")
+GAIN_DB = ("GainAbs", "Gain")  # raw steps are each vendor's own
 RATE = ("AcquisitionFrameRateAbs", "AcquisitionFrameRate")
 RATE_ENABLE = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
 RESULTING_RATE = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
@@ -66,6 +76,10 @@ class Nodes(ABC):
         """The values that an enumeration may have now; () for what is none."""
 
     @abstractmethod
+    def code(self, name: str) -> int:
+        """An enumeration's value as a number: of PixelFormat, the code that frames carry."""
+
+    @abstractmethod
     def execute(self, name: str) -> None:
         """Run a command."""
 
@@ -94,6 +108,7 @@ class SfncCamera(StreamingCamera):
         super().__init__(name, options, context)
         self._nodes_or_none: Nodes | None = None
         self._native = ""  # the pixel format's name in the camera
+        self._code = 0  # and its number
         self._tick_ns = 1.0  # of the camera's clock
         self._latch: tuple[str, str] | None = None  # the command and where its result is
         self._latched_ns: int | None = None
@@ -159,7 +174,7 @@ class SfncCamera(StreamingCamera):
 
     def _usable_format(self, nodes: Nodes) -> str:
         """The pixel format in force, or the first that can be used if that one cannot."""
-        native = str(nodes.get("PixelFormat"))
+        native = self._format_in_force(nodes)
         if layout_of(native) is None:
             usable = self._layouts(nodes)
             if not usable:
@@ -168,8 +183,14 @@ class SfncCamera(StreamingCamera):
                     f"it has none but unknown pixel formats: {native}",
                     "use its vendor's tool to convert",
                 )
-            native = next(iter(usable))
-            nodes.set("PixelFormat", native)
+            nodes.set("PixelFormat", next(iter(usable)))
+            native = self._format_in_force(nodes)
+        return native
+
+    def _format_in_force(self, nodes: Nodes) -> str:
+        """What the camera says now: the mosaic's first pixel may move with the region's corner."""
+        native = str(nodes.get("PixelFormat"))
+        self._code = nodes.code("PixelFormat")
         return native
 
     # ------------------------------------------------------------ settings
@@ -191,18 +212,21 @@ class SfncCamera(StreamingCamera):
                 raise self._refused(phase, f"it has no {names[-1]}", "leave it out")
             self._in_range(nodes, node, value, phase)
             numbers.append((node, value))
-        native = self._native
         if wanted.pixel_format is not None:
-            native = self._native_for(nodes, wanted, phase)
+            self._native_for(nodes, wanted.pixel_format, phase)
         if wanted.roi is not None:
             self._check_roi(nodes, wanted.roi, phase)
-        if native != self._native:
-            nodes.set("PixelFormat", native)
-            self._native = native
+            self._to_corner(nodes)
+            self._native = self._format_in_force(nodes)
+        if wanted.pixel_format is not None:
+            native = self._native_for(nodes, wanted.pixel_format, phase)
+            if native != self._native:
+                nodes.set("PixelFormat", native)
         if wanted.roi is not None:
             self._set_roi(nodes, wanted.roi)
         for node, value in numbers:
             nodes.set(node, value)
+        self._native = self._usable_format(nodes)
 
     def _in_range(self, nodes: Nodes, node: str, value: float, phase: str) -> None:
         low, high, _ = nodes.range(node)
@@ -215,16 +239,14 @@ class SfncCamera(StreamingCamera):
         found = {name: layout_of(name) for name in nodes.entries("PixelFormat")}
         return {name: layout for name, layout in found.items() if layout is not None}
 
-    def _native_for(self, nodes: Nodes, wanted: CameraSettings, phase: str) -> str:
+    def _native_for(self, nodes: Nodes, wanted: PixelFormat, phase: str) -> str:
         """The camera's name for the wanted format: the one in force, or else unpacked, if it has
         several."""
         layouts = self._layouts(nodes)
-        fitting = [n for n, layout in layouts.items() if layout.pixel_format is wanted.pixel_format]
+        fitting = [n for n, layout in layouts.items() if layout.pixel_format is wanted]
         if not fitting:
             have = ", ".join(sorted({layout.pixel_format for layout in layouts.values()}))
-            raise self._refused(
-                phase, f"it has no pixel format {wanted.pixel_format}", f"choose of {have}"
-            )
+            raise self._refused(phase, f"it has no pixel format {wanted}", f"choose of {have}")
         order = list(Packing)
         return min(fitting, key=lambda n: (n != self._native, order.index(layouts[n].packing), n))
 
@@ -254,15 +276,18 @@ class SfncCamera(StreamingCamera):
                     f"choose 0 to {last:g} in steps of {grid:g}",
                 )
 
+    def _to_corner(self, nodes: Nodes) -> None:
+        """Offsets limit the size, and odd ones may change the mosaic's name."""
+        for name in ("OffsetX", "OffsetY"):
+            if nodes.has(name):
+                nodes.set(name, 0)
+
     def _set_roi(self, nodes: Nodes, roi: tuple[int, int, int, int]) -> None:
-        offsets = {"OffsetX": roi[0], "OffsetY": roi[1]}
-        there = [name for name in offsets if nodes.has(name)]
-        for name in there:  # they limit the size
-            nodes.set(name, 0)
-        nodes.set("Width", roi[2])
-        nodes.set("Height", roi[3])
-        for name in there:
-            nodes.set(name, offsets[name])
+        """From the corner to a region."""
+        x, y, width, height = roi
+        for name, value in (("Width", width), ("Height", height), ("OffsetX", x), ("OffsetY", y)):
+            if value or nodes.has(name):
+                nodes.set(name, value)
 
     def _limit_rate(self, nodes: Nodes, *, on: bool) -> None:
         name = nodes.first(RATE_ENABLE)
@@ -289,12 +314,15 @@ class SfncCamera(StreamingCamera):
         )
         exposure = nodes.first(EXPOSURE)
         low, high, _ = nodes.range(exposure) if exposure else (0.0, 0.0, 0.0)
+        gain = nodes.first(GAIN)
         info = CameraInfo(
             width=width,
             height=height,
             pixel_format=pixel_format,
             black_level=self.options.black_level,
             exposure_range_us=(low, high),
+            gain_range=nodes.range(gain)[:2] if gain else None,
+            gain_unit="dB" if gain in GAIN_DB else "",
             max_rate_hz=nodes.number(RESULTING_RATE) or settings.frame_rate_hz or 0.0,
             readout_s=(nodes.number(READOUT) or 0.0) / 1e6,
             triggers=self._triggers(nodes),
@@ -336,6 +364,17 @@ class SfncCamera(StreamingCamera):
             rising = self.options.trigger_edge == "rising"
             nodes.ensure("TriggerActivation", "RisingEdge" if rising else "FallingEdge")
         nodes.ensure("TriggerMode", "On")
+
+    def _unpack(self, buffer: Buffer, out: NDArray[Any]) -> None:
+        if buffer.pixel_code not in {None, self._code} and not buffer.incomplete:
+            raise DeviceGarbled(
+                self.name,
+                "grab",
+                f"a frame with pixel format {buffer.pixel_code:#010x} came; it was set to "
+                f"{self._native}, {self._code:#010x}",
+                "does another program control it? connect again",
+            )
+        super()._unpack(buffer, out)
 
     def _fire(self) -> None:
         self._nodes("trigger").execute("TriggerSoftware")

@@ -71,6 +71,7 @@ class Buffer:
     release: Callable[[], None]
     stride: int | None = None  # bytes from row to row; None: rows follow without a gap
     incomplete: bool = False
+    pixel_code: int | None = None  # the format's number as the frame itself has it; None: unsaid
 
 
 class StreamingCamera(Camera):
@@ -228,12 +229,12 @@ class StreamingCamera(Camera):
         self._connected("start")
         self.stop()
         self._halted.clear()
-        triggers = self.info().triggers
+        triggers = [t for t in self.info().triggers if t != "none"]
         if acquisition is not Acquisition.FREE and acquisition.value not in triggers:
             raise self._refused(
                 "start",
                 f"it has no {acquisition} trigger",
-                f"it has {', '.join(triggers)}",
+                f"it has {' and '.join(triggers)}" if triggers else "it can only run free",
             )
         with self._errors("start"):
             self._arm(acquisition)

@@ -4,23 +4,16 @@ The occluder hangs on a pin at radius r of the motor's shaft, on a parallel guid
 puts it at centre + r (cos θ, sin θ). It can be nowhere else: `move` takes points of that circle,
 and `circle` only that circle.
 
-The line carries 9-byte frames: address, command, type, motor, value (int32, big endian), sum of
-the bytes before. Answers: reply address, module address, status, command, value, sum. A damaged
-answer is searched for further on in what came, then asked for again.
-
-Every command sent here is safe to send again, and is, up to `ATTEMPTS` times: reads change nothing,
-positions are absolute targets, speeds and stops are states. A position read after a reconnect means
-nothing (the module may have lost its supply, or the shaft been turned): homed first.
+A position read after a reconnect means nothing (the module may have lost its supply, or the shaft
+been turned): homed first. What the line does about damaged, late and missing answers is said in
+tmcl_line.py; every command sent here is safe to send again.
 """
 
 from __future__ import annotations
 
 import math
-import struct
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
@@ -28,7 +21,6 @@ from msgspec import Meta
 from drivers.base import (
     Context,
     DeviceError,
-    DeviceGarbled,
     DeviceLost,
     DeviceRefused,
     DeviceTimeout,
@@ -41,50 +33,13 @@ from drivers.base import (
 )
 from drivers.clock import NS
 from drivers.serialport import SerialPort, attached
+from drivers.tmcl_line import TmclLine
+from drivers.tmcl_protocol import Axis, Command, signed
 from drivers.track import Arc, Point, Track
 
-FRAME = 9
-REPLY_S = 0.2  # a module answers within 5 ms
-ATTEMPTS = 3
 NEAR_MM = 0.05  # a target this near to the circle is on it
 POLL_S = 0.02
 STALL_S = 1.0  # a motor that was told to turn has begun by then
-
-
-class Command(IntEnum):
-    """TMCL instructions that are used here."""
-
-    ROTATE_RIGHT = 1
-    ROTATE_LEFT = 2
-    STOP = 3
-    MOVE_TO = 4
-    SET_AXIS = 5
-    GET_AXIS = 6
-    REFERENCE_SEARCH = 13
-    GET_VERSION = 136
-
-
-class Axis(IntEnum):
-    """Axis parameters that are used here."""
-
-    TARGET = 0
-    POSITION = 1
-    SPEED = 3
-    MAX_SPEED = 4
-    MICROSTEPS = 140
-    PULSE_DIVISOR = 154
-
-
-STATUS = {
-    1: ("a frame reached it damaged (wrong checksum)", "check the cable"),
-    2: ("it does not know the command", "is it a TMCL stepper module?"),
-    3: ("it does not know the parameter", "set velocity_unit to match the module's firmware"),
-    4: ("a value is out of its range", "check steps_per_turn, microsteps and feeds"),
-    5: ("its EEPROM is locked", "unlock it with the maker's tool"),
-    6: ("the command is not available", "check the module's firmware"),
-}
-OK = {100, 101}
-DAMAGED = 1
 
 
 CHIPS = {(0x2A3C, None)}
@@ -127,8 +82,13 @@ class TmclStage(Stage):
         super().__init__(name, options, context)
         assert isinstance(options, TmclOptions)
         self.options = options
-        self._port = SerialPort(name, options.port, options.baud)
-        self._halted = threading.Event()
+        self._line = TmclLine(
+            SerialPort(name, options.port, options.baud),
+            context.clock,
+            options.address,
+            options.motor,
+        )
+        self._line.on_lost = self._position_lost
         self._arc = Arc(options.centre_mm, options.radius_mm)
         self._track = Track()
         self._identity: Identity | None = None
@@ -142,85 +102,25 @@ class TmclStage(Stage):
         self._raw = 0
         self._at_ns = 0
         self._stands_since_ns = 0
-        self._damaged = 0
 
     @classmethod
     def discover(cls) -> list[dict[str, Any]]:
         """See Device; nothing is opened."""
         return attached(CHIPS)
 
-    # ------------------------------------------------------------ the line
-
-    def _ask(self, command: Command, kind: int = 0, value: int = 0, *, phase: str) -> int:
-        """One exchange, repeated when it failed: every command here is safe to send again.
-
-        Raises DeviceRefused (the status by its name), DeviceTimeout, DeviceGarbled, DeviceLost.
-        """
-        o = self.options
-        frame = encode(o.address, command, kind, o.motor, value)
-        silent = True
-        for _ in range(ATTEMPTS):
-            if self._halted.is_set():
-                raise DeviceError(self.name, phase, "interrupted by a halt")
-            self._port.write(frame)
-            received = self._receive(command)
-            silent = silent and not received
-            answer = find_answer(received, o.address, command)
-            if answer is None or answer[0] == DAMAGED:
-                self._damaged += 1
-                continue
-            status, result = answer
-            if status not in OK:
-                problem, remedy = STATUS.get(status, (f"it answered status {status}", ""))
-                raise DeviceRefused(self.name, phase, f"{problem} ({command.name} {kind})", remedy)
-            return result
-        where = f"{o.port}, address {o.address}, {o.baud} baud"
-        if silent:
-            raise DeviceTimeout(
-                self.name,
-                phase,
-                f"no answer from {where} to {command.name}",
-                "check supply, cable, address and baud rate",
-            )
-        raise DeviceGarbled(
-            self.name, phase, f"only damaged answers from {where}", "check cable and baud rate"
-        )
-
-    def _receive(self, command: Command) -> bytes:
-        """What comes within `REPLY_S`, until it holds the answer. What was late is passed over."""
-        deadline = self.clock.now_ns() + round(REPLY_S * NS)
-        data = b""
-        while self.clock.now_ns() < deadline and not self._halted.is_set():
-            data += self._port.read()
-            if find_answer(data, self.options.address, command) is not None:
-                break
-        return data
-
-    def _get(self, axis: Axis, phase: str) -> int:
-        return self._ask(Command.GET_AXIS, axis, phase=phase)
-
-    def _set(self, axis: Axis, value: int, phase: str) -> None:
-        self._ask(Command.SET_AXIS, axis, value, phase=phase)
-
-    def _begin(self, phase: str) -> None:
-        self._halted.clear()
-        if not self._port.is_open:
-            raise DeviceLost(self.name, phase, "it is not connected", "reconnect it")
-
     # ------------------------------------------------------------ life
 
     def connect(self) -> Identity:
         """Open, identify, read the resolution; a motor that turns is stopped. Safe to try again."""
         self.close()
-        self._halted.clear()
-        self._port.open()
+        self._line.open()
         try:
             identity = self._identify()
-            self._ask(Command.STOP, phase="connect")
-            self._turn = self.options.steps_per_turn << self._get(Axis.MICROSTEPS, "connect")
+            self._line.ask(Command.STOP, phase="connect")
+            self._turn = self.options.steps_per_turn << self._line.get(Axis.MICROSTEPS, "connect")
             self._pps_unit = 1.0
             if self.options.velocity_unit == "internal":
-                divisor = self._get(Axis.PULSE_DIVISOR, "connect")
+                divisor = self._line.get(Axis.PULSE_DIVISOR, "connect")
                 self._pps_unit = 16e6 / (2**divisor * 2048 * 32)
         except DeviceError:
             self.close()
@@ -229,7 +129,7 @@ class TmclStage(Stage):
         return identity
 
     def _identify(self) -> Identity:
-        value = self._ask(Command.GET_VERSION, 1, phase="connect") & 0xFFFFFFFF
+        value = self._line.ask(Command.GET_VERSION, 1, phase="connect") & 0xFFFFFFFF
         model, version = str(value >> 16), f"{value >> 8 & 0xFF}.{value & 0xFF:02d}"
         if self.options.identity and self.options.identity != model:
             raise DeviceRefused(
@@ -238,7 +138,7 @@ class TmclStage(Stage):
                 f"the module is a {model}, not a {self.options.identity}",
                 "correct `port`, `address` or `identity`",
             )
-        usb = self._port.identity
+        usb = self._line.port.identity
         identity = Identity(f"TMCM-{model}", usb.serial if usb else "", version)
         before = self._identity
         if before is not None and (before.model, before.serial) != (
@@ -256,29 +156,27 @@ class TmclStage(Stage):
 
     def check(self) -> None:
         """One read of the position."""
-        self._begin("check")
+        self._line.begin("check")
         self._read("check")
 
     def safe(self) -> None:
         """Stopped, held by its current, nothing to resume."""
-        if self._port.is_open:
+        if self._line.port.is_open:
             self.stop()
 
     def halt(self) -> None:
         """See Device: a stop frame; its answer is passed over by whoever reads next."""
-        self._halted.set()
-        o = self.options
+        self._line.halt()
         if self._homing:
-            frame = encode(o.address, Command.REFERENCE_SEARCH, 1, o.motor, 0)
-            self._port.urge(frame)
-        self._port.urge(encode(o.address, Command.STOP, 0, o.motor, 0))
+            self._line.urge(Command.REFERENCE_SEARCH, 1)
+        self._line.urge(Command.STOP)
         self._held = True
 
     def close(self) -> None:
         """See Device. What turns is stopped first: nobody would hear of it."""
-        if self._port.is_open and self._motion is not None:
-            self._port.urge(encode(self.options.address, Command.STOP, 0, self.options.motor, 0))
-        self._port.close()
+        if self._line.port.is_open and self._motion is not None:
+            self._line.urge(Command.STOP)
+        self._line.port.close()
         self._position_lost()
 
     def _position_lost(self) -> None:
@@ -289,11 +187,11 @@ class TmclStage(Stage):
     def facts(self) -> dict[str, Any]:
         """See Device."""
         return {
-            "port": self._port.path or self.options.port,
+            "port": self._line.port.path or self.options.port,
             "homed": self._homed,
             "radius_mm": self.options.radius_mm,
             "microsteps_per_turn": self._turn,
-            "damaged_frames": self._damaged,
+            "damaged_frames": self._line.damaged,
         }
 
     # ------------------------------------------------------------ state
@@ -308,26 +206,26 @@ class TmclStage(Stage):
 
     def status(self) -> StageStatus:
         """See Stage."""
-        self._begin("status")
+        self._line.begin("status")
         return self._read("status")
 
     def _read(self, phase: str) -> StageStatus:
         """Position and motion now. The position is of the middle of its exchange."""
         began = self.clock.now_ns()
-        raw = self._get(Axis.POSITION, phase)
+        raw = self._line.get(Axis.POSITION, phase)
         at_ns = (began + self.clock.now_ns()) // 2
         moved = (raw - self._raw + 2**31) % 2**32 - 2**31  # the counter wraps after some hours
         seconds = (at_ns - self._at_ns) / NS
         self._raw, self._at_ns = raw, at_ns
         self._position += moved
         rate = moved / seconds if seconds > 0 else 0.0
-        speed = self._get(Axis.SPEED, phase)
+        speed = self._line.get(Axis.SPEED, phase)
         motion = self._motion
         arrived = (
             motion is not None
             and motion.target is not None
             and speed == 0
-            and raw == _signed(motion.target)
+            and raw == signed(motion.target)
         )
         if arrived:
             self._motion = None
@@ -381,43 +279,43 @@ class TmclStage(Stage):
 
     def pump(self) -> StageStatus:
         """See Stage: a reading of 4 frames (5 ms on USB, 40 ms at 9600 baud); nothing is fed."""
-        self._begin("pump")
+        self._line.begin("pump")
         return self._read("pump")
 
     # ------------------------------------------------------------ homing
 
     def home(self, timeout_s: float) -> None:
         """See Stage. The module's own reference search, as its axis parameter 193 says."""
-        self._begin("home")
+        self._line.begin("home")
         self._position_lost()
         if self.options.homing == "here":
-            self._ask(Command.STOP, phase="home")
-            self._until(lambda: self._get(Axis.SPEED, "home") == 0, timeout_s, "home")
-            self._set(Axis.TARGET, 0, "home")
-            self._set(Axis.POSITION, 0, "home")
+            self._line.ask(Command.STOP, phase="home")
+            self._until(lambda: self._line.get(Axis.SPEED, "home") == 0, timeout_s, "home")
+            self._line.set(Axis.TARGET, 0, "home")
+            self._line.set(Axis.POSITION, 0, "home")
         else:
             self._homing = True
             try:
                 self._search(timeout_s)
             finally:
                 self._homing = False
-        self._raw = self._get(Axis.POSITION, "home")
+        self._raw = self._line.get(Axis.POSITION, "home")
         self._position = self._raw
         self._at_ns = self.clock.now_ns()
         self._homed = True
         self._read("home")
 
     def _search(self, timeout_s: float) -> None:
-        self._ask(Command.REFERENCE_SEARCH, 0, phase="home")
+        self._line.ask(Command.REFERENCE_SEARCH, 0, phase="home")
         try:
             self._until(
-                lambda: self._ask(Command.REFERENCE_SEARCH, 2, phase="home") == 0,
+                lambda: self._line.ask(Command.REFERENCE_SEARCH, 2, phase="home") == 0,
                 timeout_s,
                 "home",
             )
         except DeviceTimeout:
-            self._ask(Command.REFERENCE_SEARCH, 1, phase="home")
-            self._ask(Command.STOP, phase="home")
+            self._line.ask(Command.REFERENCE_SEARCH, 1, phase="home")
+            self._line.ask(Command.STOP, phase="home")
             raise DeviceTimeout(
                 self.name,
                 "home",
@@ -430,19 +328,19 @@ class TmclStage(Stage):
         while not done():
             if self.clock.now_ns() > deadline:
                 raise DeviceTimeout(self.name, phase, f"not done within {timeout_s:g} s")
-            self.clock.wait(POLL_S, self._halted)
+            self._line.wait(POLL_S)
 
     def unlock(self) -> None:
         """See Stage: TMCL has no alarm to leave."""
-        self._begin("unlock")
-        self._ask(Command.STOP, phase="unlock")
+        self._line.begin("unlock")
+        self._line.ask(Command.STOP, phase="unlock")
         self._position_lost()
 
     # ------------------------------------------------------------ motion
 
     def move(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
         """See Stage: the shorter way round to a point of the circle. Safe to send again."""
-        self._begin("move")
+        self._line.begin("move")
         speed = self._speed("move", feed_mm_s)
         (x, y), r = self.options.centre_mm, self.options.radius_mm
         off = abs(math.hypot(x_mm - x, y_mm - y) - r)
@@ -461,7 +359,7 @@ class TmclStage(Stage):
 
     def circle(self, centre_mm: Point, radius_mm: float, feed_mm_s: float, turns: float) -> None:
         """See Stage: only the eccentric's own circle. Safe to send again. `turns` may be inf."""
-        self._begin("circle")
+        self._line.begin("circle")
         speed = self._speed("circle", feed_mm_s)
         (x, y), r = self.options.centre_mm, self.options.radius_mm
         if not (abs(radius_mm - r) <= NEAR_MM and math.dist(centre_mm, (x, y)) <= NEAR_MM):
@@ -518,57 +416,32 @@ class TmclStage(Stage):
         self._motion, self._held = motion, False
         if motion.target is None:
             turn = Command.ROTATE_RIGHT if motion.speed > 0 else Command.ROTATE_LEFT
-            self._ask(turn, 0, abs(motion.speed), phase=phase)
+            self._line.ask(turn, 0, abs(motion.speed), phase=phase)
         else:
-            self._set(Axis.MAX_SPEED, motion.speed, phase)
-            self._ask(Command.MOVE_TO, 0, _signed(motion.target), phase=phase)
+            self._line.set(Axis.MAX_SPEED, motion.speed, phase)
+            self._line.ask(Command.MOVE_TO, 0, signed(motion.target), phase=phase)
 
     def hold(self) -> None:
         """See Stage. Safe to send again."""
-        self._begin("hold")
+        self._line.begin("hold")
         self._stand("hold")
 
     def _stand(self, phase: str) -> None:
         self._held = True
-        self._ask(Command.STOP, phase=phase)
-        self._until(lambda: self._get(Axis.SPEED, phase) == 0, 3.0, phase)
+        self._line.ask(Command.STOP, phase=phase)
+        self._until(lambda: self._line.get(Axis.SPEED, phase) == 0, 3.0, phase)
         self._read(phase)
 
     def resume(self) -> None:
         """See Stage: to the same absolute target, so safe to send again."""
-        self._begin("resume")
+        self._line.begin("resume")
         self._held = False
         if self._motion is not None and self._homed:
             self._run(self._motion, "resume")
 
     def stop(self) -> None:
         """See Stage. The position stays known: a module counts while it decelerates."""
-        self._begin("stop")
+        self._line.begin("stop")
         self._stand("stop")
         self._motion, self._held = None, False
         self._read("stop")
-
-
-def _signed(steps: int) -> int:
-    """As the module's 32-bit counter shows it."""
-    return (steps + 2**31) % 2**32 - 2**31
-
-
-def checksum(data: bytes) -> int:
-    """The sum of the bytes, modulo 256."""
-    return sum(data) & 0xFF
-
-
-def encode(address: int, command: int, kind: int, motor: int, value: int) -> bytes:
-    """A request frame."""
-    body = struct.pack(">BBBBi", address, command, kind, motor, value)
-    return body + bytes([checksum(body)])
-
-
-def find_answer(data: bytes, address: int, command: int) -> tuple[int, int] | None:
-    """The last valid answer (status, value) of a module to a command, wherever it begins."""
-    for start in range(len(data) - FRAME, -1, -1):
-        frame = data[start : start + FRAME]
-        if frame[8] == checksum(frame[:8]) and frame[1] == address and frame[3] == command:
-            return frame[2], struct.unpack(">i", frame[4:8])[0]
-    return None

@@ -104,6 +104,19 @@ LAYOUTS: dict[str, Layout] = {
 }
 
 
+def _reordered(code: str) -> list[str]:
+    """The formats that differ from this one by the order of the mosaic's colours alone."""
+    like = LAYOUTS.get(code)
+    return [
+        other
+        for other, layout in LAYOUTS.items()
+        if like is not None
+        and like.pixel_format.bayer
+        and layout.pixel_format.bayer
+        and (layout.pixel_format.bits, layout.packing) == (like.pixel_format.bits, like.packing)
+    ]
+
+
 class V4l2Camera(StreamingCamera):
     """A V4L2 capture device with memory-mapped buffers."""
 
@@ -219,10 +232,11 @@ class V4l2Camera(StreamingCamera):
         if wanted.frame_rate_hz is not None:
             self._set_rate(wanted.frame_rate_hz, phase)
         size = self._roi()[2:]
-        if wanted.roi is not None and wanted.roi != self._roi():
+        cropped = wanted.roi is not None and wanted.roi != self._roi()
+        if wanted.roi is not None and cropped:
             self._set_crop(wanted.roi, phase)
             size = wanted.roi[2:]
-        if (code, size) != (self._code, self._roi()[2:]):
+        if cropped or (code, size) != (self._code, self._roi()[2:]):
             self._set_format(code, size, phase)
         for control, value in settings:
             self._node.set(control, value)
@@ -243,6 +257,11 @@ class V4l2Camera(StreamingCamera):
         return [code for code in self._node.codes() if code in LAYOUTS]
 
     def _set_format(self, code: str, size: tuple[int, int], phase: str) -> None:
+        """Set this format, or the same with the colours in the order that the camera has them in:
+        where a mosaic begins depends on the region's corner."""
+        there = self._codes()
+        if code not in there:
+            code = next((other for other in _reordered(code) if other in there), code)
         nearest = self._node.set_format(code, size)  # V4L2 would take what is near, silently
         if nearest != (code, size):
             (near_code, near) = nearest
@@ -325,6 +344,7 @@ class V4l2Camera(StreamingCamera):
             pixel_format=pixel_format,
             black_level=options.black_level,
             exposure_range_us=limits,
+            gain_range=(float(gain.minimum), float(gain.maximum)) if gain else None,
             max_rate_hz=rate,
             triggers=(*software, *hardware, "none"),
         )

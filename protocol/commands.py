@@ -24,7 +24,7 @@ from typing import (
 from protocol import messages as m
 from protocol.connection import Ask, checked, expect
 from protocol.messages import CameraSettings, RunInfo, RunState
-from protocol.patterns import AnyPattern
+from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.results import (
     Part,
     Picture,
@@ -50,6 +50,9 @@ T = TypeVar("T")
 SLOW_S = 30.0
 """The least time-out of a command whose own work takes time: an exposure, a large array."""
 
+
+EXPOSE_S = 60.0
+"""Ten exposures of the longest that auto-exposure takes by itself, and their readouts."""
 
 EXAMINE_S = 180.0
 """An examination exposes, flips and writes: seconds, and a minute with devices that time out."""
@@ -222,8 +225,12 @@ class Commands:
         return Ask(m.StopLive(), message_of, SLOW_S)
 
     @command
-    def show(self, pattern: AnyPattern, lease_s: float = 600.0) -> Ask[str]:
+    def show(
+        self, pattern: AnyPattern | Literal["white", "black"], lease_s: float = 600.0
+    ) -> Ask[str]:
         """Show a pattern by hand; the projector goes dark after `lease_s`."""
+        if isinstance(pattern, str):
+            pattern = {"white": WHITE, "black": BLACK}[pattern]
         return Ask(m.Show(pattern=pattern, lease_s=lease_s), message_of)
 
     @command
@@ -250,6 +257,17 @@ class Commands:
             roi=roi,
         )
         return Ask(m.SetCamera(settings=settings), lambda a: expect(a.reply, m.Camera).settings)
+
+    @command
+    def auto_exposure(self, longest_us: float | None = None) -> Ask[dict[str, Any]]:
+        """Let the camera's exposure be chosen for the scene as it is lit now, and no longer than
+        this; `exposure_us`, and how bright it is with it. `problem`: why it is not as wanted."""
+        settings = CameraSettings(exposure_us=longest_us)
+        return Ask(
+            m.SetCamera(settings=settings, auto_exposure=True),
+            lambda a: expect(a.reply, m.Camera).facts,
+            timeout_s=EXPOSE_S,
+        )
 
     @command
     def light(self, name: str, on: bool) -> Ask[str]:

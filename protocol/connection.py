@@ -32,6 +32,7 @@ from protocol.messages import (
     AnyEvent,
     AnyReply,
     Event,
+    Logged,
     PreviewTaken,
     Reply,
     Request,
@@ -314,8 +315,10 @@ class Inbox:
 
 
 def split_topics(topics: Sequence[str]) -> list[tuple[list[str], int]]:
-    """The subscriptions to make: previews apart, so that they can't crowd out what counts."""
-    wanted = list(topics) or [kind.topic for kind in AnyEvent.__args__ if kind is not PreviewTaken]
+    """The subscriptions to make: previews apart, so that they can't crowd out what counts. Without
+    topics all but previews and the log."""
+    asked_for = {PreviewTaken, Logged}
+    wanted = list(topics) or [kind.topic for kind in AnyEvent.__args__ if kind not in asked_for]
     states = [t for t in wanted if t != PreviewTaken.topic]
     previews = [t for t in wanted if t == PreviewTaken.topic]
     return [(t, n) for t, n in ((states, EVENTS_HWM), (previews, PREVIEWS_HWM)) if t]

@@ -20,6 +20,7 @@ class Code(enum.StrEnum):
     WRONG_STATE = "wrong_state"  # e.g. resume of a run that is done
     NO_RESULT = "no_result"  # no frame has been separated yet
     UNSUITABLE = "unsuitable"  # the rig lacks what the scan needs, or the numbers don't fit it
+    NOT_READY = "not_ready"  # what a run waited for before its first frame did not come in time
     ESTOPPED = "estopped"  # an emergency stop is in force until it is reset
     DEVICE_MISSING = "device_missing"  # the rig has no such device
     DEVICE_LOST = "device_lost"
@@ -52,6 +53,11 @@ class UmbraError(Exception):
         self.code = code
         self.message = message
         self.where = where
+
+    def __str__(self) -> str:
+        """The message, after the field that it is about: "spec.checker: Expected `int` >= 1"."""
+        field = self.where.removeprefix("$").removeprefix(".").removeprefix("command.")
+        return f"{field}: {self.message}" if field else self.message
 
     @property
     def info(self) -> ErrorInfo:

@@ -36,19 +36,21 @@ class Role(enum.StrEnum):
 class RunState(enum.StrEnum):
     """Where a run is in its life.
 
-        queued ──> running <──> paused
-           │          │ │          │
-           │          │ └────┬─────┘
-           │          v      v
-           │      finishing  aborted | failed | interrupted ──resume──> queued
-           │          v
-           │         done
-           └──> aborted
+        queued ──> waiting ──> running <──> paused
+           │          │          │ │          │
+           │          │          │ └────┬─────┘
+           │          │          v      v
+           │          │      finishing  aborted | failed | interrupted ──resume──> queued
+           │          │          v
+           │          │         done
+           └──────────┴──> aborted;  waiting ──> failed | interrupted
 
-    `interrupted` is what a restart makes of a run that was running, paused or finishing.
+    `waiting`: for what it needs before its first frame (`Progress.waits`); left out where all is
+    there. `interrupted` is what a restart makes of a run that was under way.
     """
 
     QUEUED = "queued"
+    WAITING = "waiting"
     RUNNING = "running"
     PAUSED = "paused"
     FINISHING = "finishing"  # the last frame is in; products are being written
@@ -67,14 +69,17 @@ class RigState(enum.StrEnum):
     """What the rig as a whole is doing.
 
     idle ──> manual ──> idle       a person shows patterns or takes snaps
-    idle | manual ──> scanning ──> idle
+    idle | manual ──> waiting ──> scanning <──> paused      the state of the run under way
+    waiting | scanning | paused ──> idle
     any ──> estopped ──reset──> idle
     any ──> stopping               the daemon is shutting down
     """
 
     IDLE = "idle"
     MANUAL = "manual"
+    WAITING = "waiting"  # a run waits for what it needs before its first frame
     SCANNING = "scanning"
+    PAUSED = "paused"  # dark and held, in the middle of a run
     ESTOPPED = "estopped"
     STOPPING = "stopping"
 
@@ -181,6 +186,15 @@ class RunInfo(Fact, frozen=True, kw_only=True):
     sequencing: dict[str, Any] | None = None
 
 
+class Waiting(Fact, frozen=True, kw_only=True):
+    """What a run waits for before its first frame; times are UTC, ISO 8601."""
+
+    what: str  # disk, devices, stage, light, steadiness
+    seen: str  # how it is at the last look, in words, with what is wanted
+    since: str
+    until: str  # then the run fails
+
+
 class Progress(Fact, frozen=True, kw_only=True):
     """How far a run is. `fraction` is of the plan, or of the coverage wanted."""
 
@@ -195,6 +209,7 @@ class Progress(Fact, frozen=True, kw_only=True):
     remaining_s: float | None
     phase: str = ""  # what is going on, for people
     summary: dict[str, float] = {}  # the estimator's own figures
+    waits: Waiting | None = None
 
 
 class LockInfo(Fact, frozen=True, kw_only=True):
@@ -381,7 +396,7 @@ class GetProduct(Command, frozen=True, kw_only=True, tag="product"):
 
 
 class GetLog(Command, frozen=True, kw_only=True, tag="log"):
-    """The last log records of a run, or of the daemon."""
+    """The last log records of a run, also of before a restart; or of the daemon since its start."""
 
     run: str = ""
     limit: Annotated[int, Meta(ge=1, le=10_000)] = 200
@@ -433,10 +448,15 @@ class Snap(Command, frozen=True, kw_only=True, tag="snap"):
 
 
 class SetCamera(Command, frozen=True, kw_only=True, tag="camera"):
-    """Change camera settings (none given: only read); answers with those in force."""
+    """Change camera settings (none given: only read); answers with those in force.
+
+    With `auto_exposure` the exposure is then chosen by pictures of the scene as it is lit now; an
+    exposure that is given is the longest.
+    """
 
     role: ClassVar[Role] = Role.OPERATOR
     settings: CameraSettings = CameraSettings()
+    auto_exposure: bool = False
 
 
 class SetLight(Command, frozen=True, kw_only=True, tag="light"):
@@ -630,9 +650,11 @@ class Picture(Reply, frozen=True, kw_only=True, tag="picture"):
 
 
 class Camera(Reply, frozen=True, kw_only=True, tag="camera"):
-    """Answer to `camera`: the settings in force."""
+    """Answer to `camera`: the settings in force. `facts`: of auto-exposure, what it came to; with a
+    `problem` where the level is not as it should be."""
 
     settings: CameraSettings
+    facts: dict[str, Any] = {}
 
 
 class StageStatus(Reply, frozen=True, kw_only=True, tag="stage"):
@@ -770,9 +792,16 @@ class PreviewTaken(EventBody, frozen=True, kw_only=True, tag="preview-taken"):
     facts: dict[str, Any] = {}
 
 
+class Logged(EventBody, frozen=True, kw_only=True, tag="logged"):
+    """The daemon logged something: a JSON object, as in the answer to `log`."""
+
+    topic: ClassVar[str] = "log"
+    record: dict[str, Any]
+
+
 AnyEvent = (
     RunChanged | Progressed | QueueChanged | DeviceChanged | RigChanged | StageChanged
-    | PreviewTaken
+    | PreviewTaken | Logged
 )  # fmt: skip
 
 

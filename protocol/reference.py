@@ -23,7 +23,7 @@ from protocol.connection import ATTEMPTS, EVENTS_HWM, PREVIEWS_HWM
 from protocol.errors import Code, ErrorInfo
 from protocol.following import SILENCE_S
 from protocol.patterns import AnyBinary, AnyPattern
-from protocol.scans import AnyScan, Point, Radiometry
+from protocol.scans import AnyScan, Point, Radiometry, Ready
 from protocol.wire import encode
 
 CLIENT = """\
@@ -274,7 +274,7 @@ def _enum(cls: type[enum.StrEnum]) -> Iterator[str]:
 def _facts() -> Iterator[Struct]:
     """The structs inside of others that have no section of their own, in the source's order."""
     skipped = {m.Fact, m.ArrayHeader}
-    parts = (Radiometry, Point)
+    parts = (Radiometry, Ready, Point)
     for cls in [*vars(m).values(), *parts]:
         if isinstance(cls, type) and (
             (issubclass(cls, m.Fact) and cls not in skipped) or cls in parts

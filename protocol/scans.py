@@ -67,6 +67,57 @@ class Radiometry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     ) = None
 
 
+class Ready(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What must be so before a run's first frame, and for how long that is waited for.
+
+    Room on the disk, healthy devices and a homed stage are needed by every run; light is looked at
+    where a bound is given, in pictures that are no frames of the run. Levels are those of the
+    brightest thousandth of the picture, as a share of the camera's full scale.
+    """
+
+    deadline_s: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=7 * 86_400,
+            description="seconds to wait for all that a run needs before its first frame; "
+            "0: it must be so at once",
+        ),
+    ] = 0.0
+    light_min: (
+        Annotated[
+            float, Meta(gt=0, lt=1, description="least level of light to begin at, of full scale")
+        ]
+        | None
+    ) = None
+    light_max: (
+        Annotated[float, Meta(gt=0, lt=1, description="most light to begin at, of full scale")]
+        | None
+    ) = None
+    steady: (
+        Annotated[
+            float,
+            Meta(gt=0, le=1, description="begin when the light of three looks differs by no more"),
+        ]
+        | None
+    ) = None
+    look_s: Annotated[
+        float, Meta(ge=0.1, le=600, description="seconds from one look at the light to the next")
+    ] = 10.0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for what can never be so."""
+        if self.light_min and self.light_max and self.light_min >= self.light_max:
+            raise ValueError("light_min must be below light_max")
+        if self.steady and self.deadline_s < 2 * self.look_s:
+            raise ValueError("steady takes three looks: deadline_s must be twice look_s at least")
+
+    @property
+    def looks(self) -> bool:
+        """Whether the light matters."""
+        return (self.light_min, self.light_max, self.steady) != (None, None, None)
+
+
 class Spec(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="method"
 ):
@@ -75,6 +126,14 @@ class Spec(
     note: Annotated[str, Meta(description="what the run is for, kept with it")] = ""
     exposure_us: Annotated[Positive, Meta(description="exposure of a frame in µs")] | None = None
     gain: Annotated[float, Meta(description="of the camera, in its own unit")] | None = None
+    auto_exposure: Annotated[
+        bool,
+        Meta(
+            description="choose the exposure from pictures taken before the first frame, then keep "
+            "it; an exposure that is given is the longest"
+        ),
+    ] = False
+    ready: Ready = Ready()
 
 
 class Scan(Spec, frozen=True, kw_only=True):
@@ -95,6 +154,20 @@ class PatternScan(Scan, frozen=True, kw_only=True):
     """A scan of a fixed set of patterns."""
 
     average: Annotated[Count, Meta(description="frames averaged a pattern (the paper: 32)")] = 1
+    #: Components are in counts of the run's own exposure, which need not be one of these. On a
+    #: recording each pattern's images follow one another in this order, references too.
+    bracket: (
+        Annotated[
+            tuple[Positive, ...],
+            Meta(
+                min_length=2,
+                max_length=16,
+                description="exposures of each pattern, as parts or multiples of the run's own, "
+                "merged: 0.25,1,4",
+            ),
+        ]
+        | None
+    ) = None
     lit_fraction: LitFraction | None = None  # None: the pattern's own
     #: None: as rig.toml says
     mode: (
@@ -136,6 +209,9 @@ class OccluderScan(Scan, frozen=True, kw_only=True):
     sun: Annotated[
         bool, Meta(description="the source drifts and clouds pass: follow its strength")
     ] = False
+    align: Annotated[
+        bool, Meta(description="find the camera's shake, and align or reject what it moved")
+    ] = True
     drift_deg: Annotated[
         Positive,
         Meta(description="how far the sun may have gone when an interrupted scan is resumed"),

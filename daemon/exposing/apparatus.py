@@ -15,6 +15,7 @@ import structlog
 from numpy.typing import NDArray
 
 from daemon.config import SequencerSection
+from daemon.control import Control
 from daemon.devicethread import Session
 from daemon.exposing.exposer import Behind
 from daemon.patterns import predistorted, render
@@ -63,26 +64,32 @@ class Apparatus:
         *,
         rig: Rig,
         session: Session,
+        control: Control,
         method: Method[Any],
         recorder: Recorder,
         ring: Ring,
         patience: SequencerSection,
         may_go_on: Callable[[], None],
+        on_pause: Callable[[str], None],
         taken: int,
     ) -> None:
-        """`may_go_on` is called as a sign of life; `taken` frames were had before."""
+        """`may_go_on` is called as a sign of life, `on_pause` with the reason when a pause begins;
+        `taken` frames were had before."""
         self.rig = rig
         self.session = session
+        self.control = control
         self.method = method
         self.recorder = recorder
         self.ring = ring
         self.patience = patience
         self.may_go_on = may_go_on
+        self._on_pause = on_pause
         self.clock = rig.clock
         self.camera = rig.camera
         self.projector = None if self.info.recorded else rig.projector
         self.lit: Lit | None = None
-        self.looks = Proof() if method.looked_at else None
+        full_scale = self.info.pixel_format.full_scale
+        self.looks = Proof(full_scale) if method.looked_at else None
         self.counts: dict[str, int] = {}  # frames handed on and exposures repeated, by name
         calibration = method.bench.calibration or {}
         self._latency_ns = round(float(calibration.get("latency_s", 0.0)) * NS)
@@ -92,6 +99,24 @@ class Apparatus:
         self._acquisition: Acquisition | None = None
         self._taken = taken
         self._drawing: Drawing | None = None
+
+    # ------------------------------------------------------------ pauses
+
+    def checkpoint(self) -> bool:
+        """Stay here while paused, dark and held; True if there was a pause: then nothing is lit and
+        the camera is stopped. Nothing may be under way. Raises Revoked."""
+        return self.control.checkpoint(self.session, self._paused)
+
+    def _paused(self, reason: str) -> None:
+        self.stop()
+        self.lit = None
+        if self.projector is not None:
+            self.projector.call(lambda p: p.safe(), SAFE_S, self.session)
+        for light in self.rig.lights.values():
+            light.call(lambda x: x.safe(), SAFE_S, self.session)
+        if self.rig.stage is not None:
+            self.rig.stage.call(lambda s: s.safe(), SAFE_S, self.session)
+        self._on_pause(reason)
 
     # ------------------------------------------------------------ camera
 
@@ -153,11 +178,15 @@ class Apparatus:
         self.camera.call(lambda c: c.configure(wanted), CALL_S, self.session)
 
     def buffer(self) -> Buffer:
-        """A free buffer. Raises Behind, or what went wrong in the recorder."""
-        buffer = self.ring.take(RING_S)
-        if buffer is None:
+        """A free buffer; there may have been a pause, for a disk that is full.
+
+        Raises Behind, or what went wrong in the recorder.
+        """
+        while (buffer := self.ring.take(RING_S)) is None:
             self.recorder.check()
-            raise Behind
+            if not self.control.paused:
+                raise Behind
+            self.checkpoint()
         return buffer
 
     # ------------------------------------------------------------ light

@@ -7,6 +7,8 @@ ends, so that readout and flip go on side by side:
     projector   |flip k|..........|flip k+1|..........
     camera             |expose k| readout k |expose k+1|
 
+For the exposures of a bracket the light stays.
+
 A frame counts only if its exposure lies wholly within the time in which its pattern was lit, by
 the device's own time stamps, and if it looks like its pattern (`daemon.proof`). Repeating is safe
 because a frame that is not recorded has no effect. Photographs are taken in the same way, by a
@@ -16,7 +18,7 @@ camera that needs no light.
 from __future__ import annotations
 
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import structlog
 
@@ -62,13 +64,15 @@ class Stepped(Exposer):
             if its.needs_exposure(step.exposure_us):
                 self.settle()  # what is being read out was exposed as before
                 its.set_exposure(step.exposure_us)
-            its.acquire(Acquisition.SOFTWARE)
-            lit = self._light(step)
+            if its.lit is not None and _next_of_bracket(its.lit.step, step):
+                its.lit = replace(its.lit, step=step)  # the light is this step's already
+            else:
+                its.acquire(Acquisition.SOFTWARE)
+                self._light(step)
         for sub in range(first, step.frames):
             self.settle()
-            if its.lit is not lit:  # settling had to show an earlier pattern again
-                lit = self._light(step)
-            self._pending = self._trigger(index, step, sub, lit, attempt=1)
+            its.checkpoint()  # the frames of a long step would fill the ring while the disk is full
+            self._pending = self._trigger(index, step, sub, attempt=1)
             if sub + 1 == step.frames:
                 its.draw_ahead(index + 1)
             self._await_exposure(self._pending)
@@ -79,9 +83,13 @@ class Stepped(Exposer):
             self._pending.dark_ns = self._its.clock.now_ns()
         return self._its.light(step)
 
-    def _trigger(self, index: int, step: Expose, sub: int, lit: Lit, attempt: int) -> _Exposure:
+    def _trigger(self, index: int, step: Expose, sub: int, attempt: int) -> _Exposure:
         its = self._its
         buffer = its.buffer()
+        its.acquire(Acquisition.SOFTWARE)
+        lit = its.lit
+        if lit is None or lit.step is not step:  # an earlier pattern was shown again, or a pause
+            lit = self._light(step)
         if its.projector is not None:
             its.clock.wait_until(lit.from_ns + round(step.delay_s * NS), its.session.ended)
             its.session.check()
@@ -131,8 +139,8 @@ class Stepped(Exposer):
                     attempt=exposure.attempt,
                     problem=problem,
                 )
-                lit = self._light(step)
-                self._pending = self._trigger(index, step, sub, lit, exposure.attempt + 1)
+                self._light(step)
+                self._pending = self._trigger(index, step, sub, exposure.attempt + 1)
                 self._await_exposure(self._pending)
             else:
                 its.miss(index, step, sub, problem)
@@ -148,3 +156,9 @@ class Stepped(Exposer):
         if problem or self._its.looks is None:
             return problem
         return self._its.looks.problem(frame.pixels, exposure.step, lit.look)
+
+
+def _next_of_bracket(lit: Expose, step: Expose) -> bool:
+    """Whether a step shows what the one before it shows, for another exposure of one bracket."""
+    same = (lit.pattern, lit.lighting, lit.index) == (step.pattern, step.lighting, step.index)
+    return same and lit.exposure != step.exposure

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import structlog
 
-from daemon.control import Control
 from daemon.devicethread import Stuck
 from daemon.exposing.apparatus import CALL_S, RING_S, Apparatus
 from daemon.exposing.exposer import Behind
@@ -34,13 +31,8 @@ log = structlog.get_logger(__name__)
 class Video:
     """Frames as they come; what the stream or the disk lost is an explicit missing record."""
 
-    def __init__(
-        self, apparatus: Apparatus, control: Control, on_pause: Callable[[str], None]
-    ) -> None:
-        """`on_pause` stops the camera and sends the rig to its safe state."""
+    def __init__(self, apparatus: Apparatus) -> None:
         self._its = apparatus
-        self._control = control
-        self._on_pause = on_pause
         self._silent = 0  # grabs in a row that gave nothing
         self._last: int | None = None  # number of the last frame since the stream began
         self._mover: Mover | None = None
@@ -58,9 +50,9 @@ class Video:
         try:
             while sub is not None and (step.frames is None or sub < step.frames):
                 its.may_go_on()
-                if self._mover is not None and self._control.paused:
+                if self._mover is not None and its.control.paused:
                     self._mover.end()
-                if self._control.checkpoint(its.session, self._on_pause):
+                if its.checkpoint():
                     self._set_going(step)
                 if reason := self._enough((its.clock.now_ns() - began) / NS):
                     return reason
@@ -103,6 +95,8 @@ class Video:
         buffer = its.ring.take(RING_S if info.recorded else 0.0)
         behind = buffer is None
         if buffer is None:
+            if info.recorded and its.control.paused:
+                return sub  # the disk is full
             if info.recorded:
                 raise Behind
             buffer = np.empty(info.shape, info.pixel_format.dtype)

@@ -10,6 +10,7 @@ from daemon.scans.method import Bench, Expose, Unsuitable
 from daemon.scans.pattern_scan import leakage_of, response_of
 from daemon.separation.advice import Advice, Situation
 from daemon.separation.estimator import Lighting
+from daemon.separation.exposure import Settings
 from protocol.patterns import BLACK, WHITE, Checker
 from protocol.scans import Advise, Radiometry
 
@@ -44,16 +45,21 @@ class AdviseMethod(MeasuringMethod[Advise]):
 
     def estimator(self) -> Advice:
         """See `Method`."""
-        projector = self._projector()
+        projector, camera = self._projector(), self.bench.camera
         return Advice(
             response_of(Radiometry(), self.bench),
             self._sizes,
             self._images,
             Situation(
                 error=self.spec.error,
-                exposure_us=exposure_of(self.spec.exposure_us, self.bench),
-                exposure_range_us=self.bench.camera.exposure_range_us,
-                refresh_hz=projector.refresh_hz,
+                settings=Settings(
+                    exposure_us=exposure_of(self.spec.exposure_us, self.bench),
+                    exposure_range_us=camera.exposure_range_us,
+                    refresh_hz=projector.refresh_hz,
+                    gain=self.bench.gain if self.spec.gain is None else self.spec.gain,
+                    gain_range=camera.gain_range,
+                    gain_unit=camera.gain_unit,
+                ),
                 leakage=leakage_of(Radiometry(), self.bench),
                 known=frozenset(self.bench.calibration or {}),
             ),

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from daemon import patterns
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import RankedMethod
-from daemon.separation.estimator import Estimator
+from daemon.scans.pattern_scan import FINE_PX, RankedMethod
 from daemon.separation.handedness import shift_weights
 from protocol.patterns import Checker
 from protocol.scans import Checkerboard
@@ -28,6 +27,11 @@ class CheckerboardMethod(RankedMethod[Checkerboard]):
         shifted = [Checker(size=spec.checker, shift_x=x, shift_y=y) for x, y in self._shifts]
         super().__init__(spec, bench, shifted)
 
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return self.spec.checker <= FINE_PX
+
     def described(self) -> str:
         """See `PatternMethod`."""
         return f"{self.spec.shifts} x {self.spec.shifts} shifts"
@@ -39,10 +43,6 @@ class CheckerboardMethod(RankedMethod[Checkerboard]):
     def weights(self) -> NDArray[np.complex128] | None:
         """See `RankedMethod`."""
         return shift_weights(self._shifts, 2.0 * self.spec.checker)
-
-    def estimator(self) -> Estimator:
-        """See `Method`."""
-        return self.ranking()
 
 
 def _check_coverage(spec: Checkerboard) -> None:

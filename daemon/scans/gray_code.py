@@ -8,6 +8,7 @@ from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import PatternMethod
 from daemon.separation.estimator import Estimator
 from daemon.separation.graycode import Coded, GrayCodeDecoder
+from daemon.separation.radiometry import Response
 from protocol import patterns
 from protocol.scans import GrayCode
 
@@ -35,6 +36,11 @@ class GrayCodeMethod(PatternMethod[GrayCode]):
             ],
         )
 
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return False
+
     def described(self) -> str:
         """See `PatternMethod`."""
         count = len(self._images) // 2
@@ -44,11 +50,9 @@ class GrayCodeMethod(PatternMethod[GrayCode]):
         """See `PatternMethod`."""
         return f"{super().counted()} (set --bits or --axes)"
 
-    def estimator(self) -> Estimator:
-        """See `Method`."""
-        return GrayCodeDecoder(
-            self.response, images=self._images, leakage=self.leakage, average=self.spec.average
-        )
+    def separator(self, response: Response, average: int) -> Estimator:
+        """See `PatternMethod`."""
+        return GrayCodeDecoder(response, images=self._images, leakage=self.leakage, average=average)
 
 
 def _bits(spec: GrayCode, bench: Bench, axis: patterns.Axis) -> int:

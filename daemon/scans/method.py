@@ -38,6 +38,7 @@ class Bench:
     stage: StageInfo | None = None
     lights: tuple[str, ...] = ()
     exposure_us: float | None = None  # of the camera as it is set
+    gain: float | None = None  # the same
     calibration: Mapping[str, Any] | None = None  # values that apply: see daemon.calibration
 
 
@@ -53,6 +54,7 @@ class Expose:
     index: int = 0  # which of the pattern set
     frames: int = 1
     exposure_us: float | None = None  # None: the run's
+    exposure: float = 1.0  # which of a bracket, as a multiple of the run's
     delay_s: float = 0.0  # from the light being the pattern's to the first trigger
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,9 +10,26 @@ from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
-from daemon.scans.method import Bench, Expose, Method, Motion, Step, Taken, Unsuitable, Watch
+from daemon.scans.method import (
+    Bench,
+    Circle,
+    Expose,
+    Method,
+    Motion,
+    Step,
+    Taken,
+    Unsuitable,
+    Watch,
+)
 from daemon.scans.pattern_scan import REFERENCES, response_of
 from daemon.separation.estimator import Components, Lighting, Observation
+from daemon.separation.registration import (
+    LEAST_PX,
+    REFERENCE,
+    Registration,
+    Shift,
+    aligned,
+)
 from daemon.separation.strength import SourceStrength
 from protocol.scans import OccluderScan, Reference
 
@@ -23,7 +41,22 @@ MOST_CHANGE = 0.15
 LEAST_CHANGE = 0.005
 """Within this the source has not changed."""
 
+LASTING = 50
+"""A source that is brighter than the reference for so many frames in a row is the reference."""
+
+VAIN_TURNS = 5
+"""Turns of the circle that cover no more: then it never will."""
+
+GROWTH = 0.0005
+"""Coverage grows by as much, or noise moves it."""
+
 INCOMPLETE = "incomplete frame"
+CLOUD = "cloud"
+SHAKEN = "moved too far, or too blurred, to be aligned"
+PLACED = "before the camera's place was known"
+BRIGHTER = "brighter than when the scan began"
+BEGAN_DARK = "cloud at the start"
+LEARNED = "before the source's strength was known"
 
 _LEAST_FRAMES = 2
 
@@ -54,7 +87,14 @@ class OccluderMethod(Method[O]):
                 "nothing leaks into an umbra: leave the leakage away", "$.radiometry.leakage"
             )
         self._source = SourceStrength(self.response) if spec.sun else None
+        mesh = self.name == "mesh"
+        self._camera = Registration(self.response, mesh=mesh) if spec.align else None
+        self._place = "" if spec.align else "not looked for"
+        self._aligned = 0  # frames of the present collection
         self._rejected: Counter[str] = Counter()
+        self._used = 0  # frames of the occluder in the present collection
+        self._brighter = 0  # frames in a row
+        self._in_vain = _InVain()
         self._references = tuple(Expose(*REFERENCES[reference]) for reference in wanted)
         self._watch = Watch(
             self._frames(), motion if self._live else None, self._lights() if self._live else ()
@@ -107,46 +147,148 @@ class OccluderMethod(Method[O]):
         if taken.incomplete or taken.pixels is None:
             self._rejected[INCOMPLETE] += 1
             return Observation(lighting=lighting, used=False, reason=INCOMPLETE)
-        if self._source is None or lighting is not Lighting.PATTERN:
+        if lighting is not Lighting.PATTERN:
             return Observation(lighting=lighting)
-        strength = round(self._source.of(taken.pixels), 4)
-        if abs(strength - 1.0) > MOST_CHANGE:
-            why = "cloud" if strength < 1.0 else "brighter than when the scan began"
-            self._rejected[why] += 1
-            return Observation(used=False, reason=f"source at {strength:.0%}: {why}")
-        if abs(strength - 1.0) < LEAST_CHANGE or not self._source.learned:
-            strength = 1.0
-        self._source.accept(strength)
-        return Observation(strength=strength)
+        return self._decide(taken.pixels)
 
     def recall(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """See `Method`: the source's strength is followed on from where it was."""
-        if self._source is None or observation.lighting is not Lighting.PATTERN:
-            return
-        if not observation.used:
-            self._rejected[observation.reason.rpartition(": ")[2]] += 1
+        """See `Method`: what was decided before is decided again, to be followed on."""
         if observation.reason == INCOMPLETE:
-            return
-        self._source.of(pixels)
-        if observation.used:
-            self._source.accept(observation.strength)
+            self._rejected[INCOMPLETE] += 1
+        elif observation.lighting is Lighting.PATTERN:
+            self._decide(pixels)
+
+    def _decide(self, pixels: NDArray[Any]) -> Observation:
+        """What a complete frame of the occluder is used for; counted. Depends on nothing but the
+        frames before, so that it may be done again."""
+        shift = self._shift(pixels)
+        warp = shift.warp if shift is not None and shift.found and shift.px > LEAST_PX else None
+        bayer = bool(self.response.bayer)
+        lies = pixels if warp is None else aligned(pixels, warp, bayer)
+        fresh, strength = self._weather(lies)
+        if abs(strength - 1.0) > MOST_CHANGE:
+            why = CLOUD if strength < 1.0 else BRIGHTER
+            self._rejected[why] += 1
+            return Observation(used=False, reason=f"source at {strength:.0%}: {why}")
+        if shift is not None and not shift.found:
+            self._rejected[SHAKEN] += 1
+            return Observation(used=False, reason=SHAKEN)
+        if self._source is not None:
+            known = self._source.learned
+            self._source.accept()
+            if self._source.learned and not known and self._live:
+                fresh = LEARNED
+        if shift is None and self._learn_place(pixels):
+            fresh, shift = PLACED, self._camera.of(pixels) if self._camera else None
+            warp = shift.warp if shift is not None and shift.px > LEAST_PX else None
+        if fresh:
+            self._rejected[fresh] += self._used
+            self._used = self._aligned = 0
+        self._used += 1
+        self._aligned += warp is not None
+        if abs(strength - 1.0) < LEAST_CHANGE:
+            strength = 1.0
+        return Observation(strength=strength, warp=warp, fresh=bool(fresh), reason=fresh)
+
+    def _shift(self, pixels: NDArray[Any]) -> Shift | None:
+        """How far the camera has moved; None: that is not known (yet), or not looked for."""
+        camera = self._camera
+        if camera is None:
+            return None
+        if not camera.suits(pixels.shape):
+            self._camera, self._place = None, "not looked for: the picture is too small"
+            return None
+        return camera.of(pixels) if camera.learned else None
+
+    def _learn_place(self, pixels: NDArray[Any]) -> bool:
+        """Take a frame into the reference for the camera's place. True: it is known now, and the
+        camera moved before."""
+        camera = self._camera
+        if camera is None:
+            return False
+        camera.learn(pixels)
+        if not camera.learned:
+            return False
+        if not camera.tells:
+            self._camera, self._place = None, "not looked for: the scene has too little texture"
+            return False
+        self._place = f"known to {camera.sd:.2g} px"
+        if camera.wandered < 2.0 * LEAST_PX:
+            return False
+        if not self._live:
+            self._place += (
+                f"; the first {REFERENCE} frames lay up to {camera.wandered:.1f} px apart"
+            )
+        return self._live
+
+    def _weather(self, pixels: NDArray[Any]) -> tuple[str, float]:
+        """Why the collection begins anew with this frame ("": it does not), and the source's
+        strength in it."""
+        source = self._source
+        if source is None:
+            return "", 1.0
+        strength = round(source.of(pixels), 4)
+        self._brighter = self._brighter + 1 if strength > 1.0 + MOST_CHANGE else 0
+        if self._brighter < LASTING:
+            return "", strength
+        self._brighter = 0
+        source.restart()
+        return BEGAN_DARK, 1.0
 
     def conclude(self, components: Components) -> Components:
-        """See `Method`: with the frames that were not used, by reason, among the facts."""
-        if not self._rejected:
-            return components
-        return replace(components, facts={**components.facts, "rejected": dict(self._rejected)})
+        """See `Method`: with the frames that were aligned, and that were not used, by reason, among
+        the facts."""
+        facts: dict[str, Any] = {"aligned_frames": self._aligned}
+        if self._place:
+            facts["camera_place"] = self._place
+        if self._rejected:
+            facts["rejected"] = dict(self._rejected)
+        return replace(components, facts={**components.facts, **facts})
 
     def enough(self, summary: Mapping[str, float], seconds: float) -> str:
         """See `Method`: covered, or out of time."""
         if not self._live or self._watch.motion is None:
             return ""
         covered = summary.get("coverage", 0.0)
+        wanted = f"{self.spec.coverage:.1%}"
         if covered >= self.spec.coverage:
-            return f"{covered:.1%} of the lit pixels are covered, {self.spec.coverage:.1%} wanted"
+            return f"{covered:.1%} of the lit pixels are covered, {wanted} wanted"
         if seconds >= self.spec.time_limit_s:
             return (
                 f"the time limit of {self.spec.time_limit_s:g} s, at {covered:.1%} of "
-                f"{self.spec.coverage:.1%} coverage"
+                f"{wanted} coverage"
+            )
+        turns = self._in_vain.turns(summary, seconds, self._watch.motion)
+        if turns >= VAIN_TURNS:
+            return (
+                f"{covered:.1%} of the lit pixels are covered, {wanted} wanted: {VAIN_TURNS} turns "
+                "covered no more; what is left this circle does not reach, or it lies in shadows "
+                "or mirrors of the scene's own that are narrower than the mesh's pitch"
             )
         return ""
+
+
+class _InVain:
+    """Counts turns of a circle that brought no coverage; frames that were not used don't count."""
+
+    def __init__(self) -> None:
+        self._most = 0.0
+        self._frames = 0.0  # in use when coverage last grew
+        self._began: tuple[float, float] | None = None  # seconds and frames, at the first question
+
+    def turns(self, summary: Mapping[str, float], seconds: float, motion: Motion) -> float:
+        """Turns since coverage grew; 0 for a motion that has an end."""
+        if not isinstance(motion, Circle):
+            return 0.0
+        frames = summary.get("frames", 0.0)
+        every = frames + summary.get("unused", 0.0)
+        if self._began is None:
+            self._began = seconds, every
+        covered = summary.get("coverage", 0.0)
+        if covered > self._most + GROWTH or frames < self._frames:
+            self._most, self._frames = covered, frames
+        passed, taken = seconds - self._began[0], every - self._began[1]
+        if passed <= 0.0 or taken <= 0.0:
+            return 0.0
+        turn_s = math.tau * motion.radius_mm / motion.feed_mm_s
+        return (frames - self._frames) * passed / taken / turn_s

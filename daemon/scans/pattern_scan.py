@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar, TypeVar
 
 import cv2
@@ -10,13 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon import patterns
+from daemon.scans.calibrate_dark import exposure_of
 from daemon.scans.method import Bench, Expose, Method, Step, Taken, Unsuitable
+from daemon.separation.bracket import Bracketed
 from daemon.separation.estimator import Estimator, Lighting, Observation
+from daemon.separation.exposure_noise import ROUNDING, Sensor
 from daemon.separation.extremes import MaxMin
+from daemon.separation.frameset import FrameSet, Watched
 from daemon.separation.radiometry import Response
 from daemon.separation.topk import KEEP, TopK
 from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.scans import PatternScan, Radiometry, Reference
+
+FINE_PX = 64
+"""Patterns of larger checkers, patches or periods may light one end of a scene alone."""
 
 _PLACES, _MARGIN, _SAMPLES = 96, 8, 1500
 
@@ -63,6 +72,13 @@ class PatternMethod(Method[P]):
     `estimators` are those that a method has; the first is what auto chooses.
 
     On a recording a reference is one image, and only those named in the spec are there.
+
+    A bracket takes all exposures of a pattern (and of a reference) before the next pattern: then a
+    pattern's light is merged as soon as it is there, in constant memory, and a source that drifts
+    does so between patterns, as without a bracket. To change the exposure stops the camera, so a
+    live scan goes through the bracket to and fro (1, 4, 16, then 16, 4, 1): each pattern begins
+    with the exposure that the one before it ended with. On a recording the images of each pattern
+    are in the bracket's order, as cameras that bracket by themselves make them.
     """
 
     estimators: ClassVar[tuple[str, ...]] = ("maxmin",)
@@ -76,7 +92,8 @@ class PatternMethod(Method[P]):
             )
         self.response = response_of(spec.radiometry, bench)
         self.leakage = leakage_of(spec.radiometry, bench)
-        self._plan = (*self._references(), *self._exposures(pattern_set))
+        self._own_us = 0.0  # the run's exposure; 0: not known
+        self._plan = self._bracketed([*self._references(), *self._exposures(pattern_set)])
         self._patterns = tuple(pattern_set)
         self._check()
 
@@ -97,6 +114,37 @@ class PatternMethod(Method[P]):
             for index, pattern in enumerate(pattern_set)
         ]
 
+    def _bracketed(self, plain: list[Expose]) -> tuple[Expose, ...]:
+        """Each step at each exposure of the bracket. Raises Unsuitable for what cannot be had."""
+        factors = self.spec.bracket
+        if factors is None:
+            return tuple(plain)
+        if len(set(factors)) < len(factors):
+            raise Unsuitable(
+                "each exposure of a bracket is to be named once (more frames of it: --average)",
+                "$.bracket",
+            )
+        if self.bench.camera.recorded:
+            return tuple(replace(step, exposure=f) for step in plain for f in factors)
+        # with auto-exposure the spec's own is the longest that may be chosen
+        asked_us = None if self.spec.auto_exposure else self.spec.exposure_us
+        own_us = exposure_of(asked_us, self.bench)
+        self._own_us = self.bench.exposure_us or own_us
+        shortest, longest = self.bench.camera.exposure_range_us
+        beyond = [f for f in factors if not shortest <= f * own_us <= longest]
+        if beyond:
+            raise Unsuitable(
+                f"the camera exposes {shortest:g} to {longest:g} us, and {beyond[0]:g} times "
+                f"{own_us:g} us is beyond that: choose from {shortest / own_us:.3g} to "
+                f"{longest / own_us:.3g} (--bracket), or another exposure (--exposure)",
+                "$.bracket",
+            )
+        return tuple(
+            replace(step, exposure=f, exposure_us=None if f == 1.0 else f * own_us)
+            for turn, step in enumerate(plain)
+            for f in (factors if turn % 2 == 0 else factors[::-1])
+        )
+
     def _check(self) -> None:
         camera = self.bench.camera
         if not camera.recorded:
@@ -114,12 +162,17 @@ class PatternMethod(Method[P]):
 
     def counted(self) -> str:
         """How the number of frames comes about and how to change it, for people."""
-        references = [step for step in self._plan if step.lighting is not Lighting.PATTERN]
+        references = dict.fromkeys(
+            step.lighting for step in self._plan if step.lighting is not Lighting.PATTERN
+        )
         parts = [self.described()]
         if self.spec.average > 1:
             parts.append(f"{self.spec.average} averaged a pattern")
         if references:
-            parts.append(f"with {', '.join(step.lighting for step in references)} first")
+            parts.append(f"with {', '.join(references)} first")
+        if self.spec.bracket:
+            shown = ", ".join(f"{f:g}" for f in self.spec.bracket)
+            parts.append(f"each at the {len(self.spec.bracket)} exposures {shown} (set --bracket)")
         return f"{', '.join(parts)} need {self.planned()}"
 
     def described(self) -> str:
@@ -168,13 +221,63 @@ class PatternMethod(Method[P]):
         """See `Method`. An incomplete frame is not used; its pattern is averaged over the rest."""
         if not isinstance(step, Expose):
             raise TypeError(f"{self.name} plans no step {step!r}")
+        last = taken.sub == step.frames - 1
+        if self.spec.bracket is not None:
+            after = self._plan[taken.step + 1 : taken.step + 2]
+            last = last and not (after and _of_one(step, after[0]))
         return Observation(
             lighting=step.lighting,
             pattern=step.index,
-            last=taken.sub == step.frames - 1,
+            last=last,
             used=not taken.incomplete,
             reason="incomplete frame" if taken.incomplete else "",
+            exposure=step.exposure,
+            exposure_us=taken.exposure_us if self._own_us else 0.0,
         )
+
+    def estimator(self) -> Estimator:
+        """See `Method`. Exposures of a bracket are merged before the method's own estimator."""
+        if self.spec.bracket is None:
+            return self._watched(self.response, self.spec.average)
+        return Bracketed(
+            self.response,
+            lambda response: self._watched(response, 1),
+            factors=self.spec.bracket,
+            average=self.spec.average,
+            own_us=self._own_us,
+            sensor=self._sensor(),
+        )
+
+    def _watched(self, response: Response, average: int) -> Estimator:
+        frames = FrameSet(response, even=self.even, distinct=self.distinct)
+        return Watched(self.separator(response, average), frames)
+
+    @property
+    def even(self) -> bool:
+        """Whether each pattern gives the scene as a whole the same light."""
+        return True
+
+    @property
+    def distinct(self) -> bool:
+        """Whether no two patterns are alike."""
+        return True
+
+    def _sensor(self) -> Sensor | None:
+        """The camera's noise as calibrated; None where it is not, or counts are not linear."""
+        known = (self.bench.calibration or {}).get("noise")
+        if known is None or not self.response.is_linear:
+            return None
+        return Sensor(known["read_counts"] ** 2 + ROUNDING, known["counts_per_e"])
+
+    @abstractmethod
+    def separator(self, response: Response, average: int) -> Estimator:
+        """A fresh estimator of the method, for `average` frames a pattern and a response to light
+        that is the camera's, or that of its merged exposures."""
+
+
+def _of_one(step: Expose, other: Expose) -> bool:
+    """Whether two steps are exposures of one pattern."""
+    return (step.lighting, step.index) == (other.lighting, other.index)
 
 
 class RankedMethod(PatternMethod[P]):
@@ -187,9 +290,9 @@ class RankedMethod(PatternMethod[P]):
         """What tells the pattern's place at a pixel: see `handedness.WaveSums`. None: nothing."""
         return None
 
-    def ranking(self) -> Estimator:
-        """The paper's max/min where it is asked for, or where there are too few patterns to rank;
-        else topk."""
+    def separator(self, response: Response, average: int) -> Estimator:
+        """See `PatternMethod`. The paper's max/min where it is asked for, or where there are too
+        few patterns to rank; else topk."""
         name = self.spec.estimator
         if name == "topk" and len(self._patterns) < 2 * KEEP:
             raise Unsuitable(
@@ -198,17 +301,18 @@ class RankedMethod(PatternMethod[P]):
             )
         if name == "maxmin" or len(self._patterns) < 2 * KEEP:
             return MaxMin(
-                self.response,
+                response,
                 lit_fraction=self.lit_fraction,
                 leakage=self.leakage,
-                average=self.spec.average,
+                average=average,
                 levels=self.levels,
+                weights=self.weights(),
             )
         return TopK(
-            self.response,
+            response,
             lit_fraction=self.lit_fraction,
             leakage=self.leakage,
             levels=self.levels,
-            average=self.spec.average,
+            average=average,
             weights=self.weights(),
         )

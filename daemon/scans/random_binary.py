@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import RankedMethod
-from daemon.separation.estimator import Estimator
+from daemon.scans.pattern_scan import FINE_PX, RankedMethod
+from daemon.separation.residue import patch_weights
 from protocol import patterns
 from protocol.scans import RandomBinary
 
@@ -40,6 +43,11 @@ class RandomBinaryMethod(RankedMethod[RandomBinary]):
             ],
         )
 
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return self.spec.patch <= FINE_PX
+
     def described(self) -> str:
         """See `PatternMethod`."""
         return f"{self.spec.patterns} random patterns"
@@ -48,6 +56,6 @@ class RandomBinaryMethod(RankedMethod[RandomBinary]):
         """See `PatternMethod`."""
         return f"{super().counted()} (set --patterns)"
 
-    def estimator(self) -> Estimator:
-        """See `Method`."""
-        return self.ranking()
+    def weights(self) -> NDArray[np.complex128]:
+        """See `RankedMethod`."""
+        return patch_weights(self.spec.patterns)

@@ -7,6 +7,7 @@ from typing import ClassVar
 from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import PatternMethod
 from daemon.separation.estimator import Estimator
+from daemon.separation.radiometry import Response
 from daemon.separation.single import PeaksAndValleys
 from protocol.patterns import Stripes
 from protocol.scans import SingleImage
@@ -34,6 +35,16 @@ class SingleImageMethod(PatternMethod[SingleImage]):
         stripes = Stripes(width=spec.stripe, axis=spec.axis)
         super().__init__(spec, bench, [stripes] * spec.repeat)
 
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return False  # a stream may show anything
+
+    @property
+    def distinct(self) -> bool:
+        """See `PatternMethod`."""
+        return False
+
     def described(self) -> str:
         """See `PatternMethod`."""
         return "one image" if self.spec.repeat == 1 else f"{self.spec.repeat} images"
@@ -47,10 +58,11 @@ class SingleImageMethod(PatternMethod[SingleImage]):
         """α of the stripes: as asked for, else their own on this projector, else a half."""
         return self.lit_fraction_of(self._patterns[:1])
 
-    def estimator(self) -> Estimator:
-        """See `Method`."""
+    def separator(self, response: Response, average: int) -> Estimator:
+        """See `PatternMethod`."""
+        del average  # frames are averaged until the last of a pattern
         return PeaksAndValleys(
-            self.response,
+            response,
             lit_fraction=self.lit_fraction,
             leakage=self.leakage,
             window=self.spec.window,

@@ -8,8 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import PatternMethod
+from daemon.scans.pattern_scan import FINE_PX, PatternMethod
 from daemon.separation.estimator import Estimator
+from daemon.separation.radiometry import Response
 from daemon.separation.sinusoid import LeastSquares
 from protocol import patterns
 from protocol.scans import RandomPhase, Sinusoid
@@ -31,6 +32,11 @@ class SinusoidMethod(PatternMethod[Sinusoid]):
             raise Unsuitable("each period is to be named once", "$.periods")
         super().__init__(spec, bench, shown)
 
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return max(self.spec.periods) <= FINE_PX
+
     def described(self) -> str:
         """See `PatternMethod`."""
         count = len(self.spec.periods)
@@ -41,14 +47,15 @@ class SinusoidMethod(PatternMethod[Sinusoid]):
         """See `PatternMethod`."""
         return f"{super().counted()} (set --phases or --periods)"
 
-    def estimator(self) -> Estimator:
-        """See `Method`."""
+    def separator(self, response: Response, average: int) -> Estimator:
+        """See `PatternMethod`."""
+        del average  # every frame is fitted
         projector = self.bench.projector
         along = None
         if projector is not None:
             along = projector.width if self.spec.axis is patterns.Axis.X else projector.height
         return LeastSquares(
-            self.response,
+            response,
             phases=[
                 (frequency, phase)
                 for frequency in range(len(self.spec.periods))
@@ -59,6 +66,7 @@ class SinusoidMethod(PatternMethod[Sinusoid]):
             size=along,
             weave=self.spec.weave,
             axis=self.spec.axis,
+            blur_px=(self.bench.calibration or {}).get("optics_blur_px"),
         )
 
 
@@ -75,6 +83,11 @@ class RandomPhaseMethod(PatternMethod[RandomPhase]):
         ]
         super().__init__(spec, bench, shown)
 
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return self.spec.patch <= FINE_PX
+
     def described(self) -> str:
         """See `PatternMethod`."""
         return f"{self.spec.phases} phases"
@@ -83,10 +96,11 @@ class RandomPhaseMethod(PatternMethod[RandomPhase]):
         """See `PatternMethod`."""
         return f"{super().counted()} (set --phases)"
 
-    def estimator(self) -> Estimator:
-        """See `Method`."""
+    def separator(self, response: Response, average: int) -> Estimator:
+        """See `PatternMethod`."""
+        del average  # every frame is fitted
         return LeastSquares(
-            self.response,
+            response,
             phases=[(0, phase) for phase in _phases(self.spec.phases)],
             leakage=self.leakage,
         )

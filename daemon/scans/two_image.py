@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import ClassVar
 
 from daemon.scans.method import Bench, Unsuitable
-from daemon.scans.pattern_scan import PatternMethod
+from daemon.scans.pattern_scan import FINE_PX, PatternMethod
 from daemon.separation.estimator import Estimator
 from daemon.separation.light_model import complement_determinants
 from daemon.separation.pair import ComplementPair
+from daemon.separation.radiometry import Response
 from protocol.patterns import Checker
 from protocol.scans import TwoImage
 
@@ -38,15 +39,20 @@ class TwoImageMethod(PatternMethod[TwoImage]):
         """α of the first image: as asked for, else the checkerboard's own on this projector."""
         return self.lit_fraction_of(self._patterns[:1])
 
+    @property
+    def even(self) -> bool:
+        """See `PatternMethod`."""
+        return self.spec.checker <= FINE_PX and abs(self.lit_fraction - 0.5) < 0.05
+
     def described(self) -> str:
         """See `PatternMethod`."""
         return "a pattern and its complement"
 
-    def estimator(self) -> Estimator:
-        """See `Method`."""
+    def separator(self, response: Response, average: int) -> Estimator:
+        """See `PatternMethod`."""
         return ComplementPair(
-            self.response,
+            response,
             lit_fraction=self.lit_fraction,
             leakage=self.leakage,
-            average=self.spec.average,
+            average=average,
         )

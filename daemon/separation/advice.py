@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.blur import of_optics, of_wave
 from daemon.separation.contrast import CheckerContrast
 from daemon.separation.estimator import (
     Curve,
@@ -25,6 +26,7 @@ from daemon.separation.estimator import (
     Observation,
     Plot,
 )
+from daemon.separation.exposure import Setting, Settings, filling
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.sampling import Mask, Moments, Turns, bright
 
@@ -33,7 +35,7 @@ _PEAK = 0.85  # of full scale: where the brightest part of the scene should be
 _CHECKER_SD = 1.9  # of a frame's noise: error of 25 shifts by their largest and smallest samples
 _SINUSOID = 12.0  # variance of global, in a frame's, times the number of phases
 _MOST_PHASES = 25
-_FULL_SECOND = 1e6
+_WEAVE = 1.0  # of the sinusoids that are advised: a scan's default
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +44,7 @@ class Situation:
     calibration's values."""
 
     error: float
-    exposure_us: float
-    exposure_range_us: tuple[float, float]
-    refresh_hz: float
+    settings: Settings
     leakage: float = 0.0
     known: frozenset[str] = frozenset()
 
@@ -107,8 +107,10 @@ class Advice:
         good = bright(ambient, white, self._saturated)
         full = self._response.linear_full_scale
         sizes = np.asarray(self._sizes, dtype=np.float64)
-        blur, local = self._errors(good, full)
-        factor, exposure_us, light = self._exposure(white, full)
+        direct = self._direct(good)
+        kept = self._kept(good, direct)
+        blur, local, level = self._errors(good, kept, full)
+        setting, light = self._exposure(white, full)
         variance = self._references[Lighting.WHITE].variance()[good]
         noise = float(np.sqrt(variance.mean(dtype=np.float64))) / full  # of a frame, full scale
         total = np.sqrt(blur**2 + local**2)
@@ -116,8 +118,13 @@ class Advice:
         enough = max(1.1 * float(total.min()), self._situation.error / 2)
         best = int(np.argmax(total <= enough))
         size = self._sizes[best]
-        later = noise * factor**0.5  # shot noise at the exposure that is advised
-        images = _images(later, self._situation.error)
+        later = noise * setting.noise  # at the exposure and gain that are advised
+        exposure_us = setting.exposure_us or self._situation.settings.exposure_us
+        unit = self._situation.settings.gain_unit
+        blur, local = setting.level * blur, setting.level * local
+        total = setting.level * total
+        periods = self._periods(kept, 2 * size, setting.level * level)
+        images = _images(later, self._situation.error, len(periods))
         scale = self._scale(good)
         limits = [
             ("camera resolution" if scale > size / 4 else "projector blur", float(blur[best])),
@@ -126,19 +133,21 @@ class Advice:
         ]
         limits.sort(key=lambda limit: -limit[1])
         reached = float(np.hypot(total[best], images.noise))
-        advice = self._lines(size, limits, reached, light)
-        exposure = "" if factor == 1.0 else f" --exposure {exposure_us:.0f}"
+        advice = self._lines(size, periods, limits, reached, light)
+        exposure = "" if setting.exposure_us is None else f" --exposure {setting.exposure_us:.0f}"
+        if setting.gain is not None:
+            exposure += f" --gain {setting.gain:g}"
         step = max(1, 3 * size // 8)
         shifts = ceil(size / step) + 2
         commands = [
             f"umbra scan checkerboard --checker {size} --shift {step} --shifts {shifts} "
             f"--average {images.checker_average}{exposure}",
-            f"umbra scan sinusoid --periods {2 * size} --phases {images.phases} "
+            f"umbra scan sinusoid --periods {','.join(map(str, periods))} --phases {images.phases} "
             f"--average {images.sinusoid_average}{exposure}",
         ]
         facts = {
             "checker_px": size,
-            "period_px": 2 * size,
+            "periods_px": periods,
             "shifts": shifts,
             "shift_px": step,
             "phases": images.phases,
@@ -147,8 +156,9 @@ class Advice:
                 "sinusoid": images.sinusoid_average,
             },
             "exposure_us": round(exposure_us, 1),
-            "exposure_factor": round(factor, 4),
-            "gain": "as it is; lower it before exposing more briefly",
+            "gain": self._situation.settings.gain if setting.gain is None else setting.gain,
+            "gain_unit": self._situation.settings.gain_unit,
+            "level_factor": round(setting.level, 4),
             "wanted_error": self._situation.error,
             "expected_error": round(reached, 5),
             "noise_of_a_frame": round(noise, 6),
@@ -161,8 +171,12 @@ class Advice:
             "commands": commands,
             "figures": [
                 ["checkers", f"{size} px"],
-                ["sinusoid", f"period {2 * size} px, {images.phases} phases"],
+                ["sinusoid", f"{_named(periods)}, {images.phases} phases"],
                 ["exposure", f"{exposure_us / 1e3:.4g} ms"],
+                [
+                    "gain",
+                    "as it is" if setting.gain is None else f"{setting.gain:g} {unit}".strip(),
+                ],
                 ["expected error", f"{reached:.2%} of full scale"],
                 ["limited by", str(limits[0][0])],
             ],
@@ -182,15 +196,33 @@ class Advice:
         )
         return Measurement(facts, {"sizes": plot})
 
-    def _errors(self, good: Mask, full: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """RMS errors of each size over the good samples, of full scale: by blur, and by light that
-        scatters over less than the size. Raises NotYet where no size is resolved."""
+    def _direct(self, good: Mask) -> Mask:
+        """Which of the good samples see enough direct light for a ratio of it. Raises NotYet."""
         largest = self._planes[-1][good]
-        direct = largest > 0.1 * np.quantile(largest, 0.99)  # else ratios are noise
+        direct: Mask = largest > 0.1 * np.quantile(largest, 0.99)
         if not direct.any():
             raise NotYet("no pixel sees direct light of the projector: is it in focus?")
-        kept = [float(np.median(plane[good][direct] / largest[direct])) for plane in self._planes]
-        kept = [min(k, 1.0) for k in kept]
+        return direct
+
+    def _kept(self, good: Mask, direct: Mask) -> list[float]:
+        """What each size keeps of the largest's contrast on most surfaces."""
+        largest = self._planes[-1][good][direct]
+        kept = [float(np.median(plane[good][direct] / largest)) for plane in self._planes]
+        return [min(k, 1.0) for k in kept]
+
+    def _periods(self, kept: list[float], period: int, level: float) -> list[int]:
+        """One period where blur takes little of the direct light of a wave, or how much is known;
+        else two, whose ratio tells it."""
+        lost = 1.0 - of_wave(of_optics(dict(zip(self._sizes, kept, strict=True))), period, _WEAVE)
+        if "optics_blur_px" in self._situation.known or lost * level < self._situation.error / 4:
+            return [period]
+        return [period, 5 * period // 3]
+
+    def _errors(
+        self, good: Mask, kept: list[float], full: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """RMS errors of each size over the good samples, of full scale: by blur, and by light that
+        scatters over less than the size; and direct light itself."""
         finest = next(n for n, k in enumerate(kept) if k >= _RESOLVED)
         base = self._planes[finest][good] / kept[finest]
         scale = 1.0 / ((1.0 - self._situation.leakage) * full)
@@ -203,26 +235,18 @@ class Advice:
             excess = (plane[good] / k - base).astype(np.float64)
             grown = excess[excess > np.quantile(np.abs(np.minimum(excess, 0)), 0.95)]
             local.append(float(np.sqrt(np.sum(grown**2) / excess.size)) * scale)
-        return blur, np.asarray(local)
+        return blur, np.asarray(local), level
 
-    def _exposure(self, white: Plane, full: float) -> tuple[float, float, str]:
-        """Factor, exposure (µs) and what there is to say, for the scene to fill the scale."""
-        now = self._situation.exposure_us
-        low, high = self._situation.exposure_range_us
+    def _exposure(self, white: Plane, full: float) -> tuple[Setting, str]:
+        """What lets the scene fill the scale, and what there is to say."""
         assert self._saturated is not None
         hot = float(np.mean(self._saturated))
         if hot > 0.001:
-            wanted, said = now / 2, f"{hot:.1%} of the pixels are saturated under white"
+            factor, said = 0.5, f"{hot:.1%} of the pixels are saturated under white"
         else:
             peak = float(np.quantile(white, 0.999)) / full
-            wanted, said = now * _PEAK / max(peak, 1e-3), f"white reaches {peak:.0%} of the scale"
-        wanted = min(max(wanted, low), high, max(now, _FULL_SECOND))
-        period = 1e6 / self._situation.refresh_hz
-        if wanted >= period:
-            wanted = wanted // period * period
-        if abs(wanted / now - 1) < 0.1:
-            wanted = now
-        return wanted / now, wanted, said
+            factor, said = _PEAK / max(peak, 1e-3), f"white reaches {peak:.0%} of the scale"
+        return filling(self._situation.settings, factor), said
 
     def _scale(self, good: Mask) -> float:
         """Projector pixels that a camera pixel spans, from how often large checkers change."""
@@ -236,10 +260,15 @@ class Advice:
         return float(changed.sum() / both.sum()) * self._sizes[-1] / step
 
     def _lines(
-        self, size: int, limits: list[tuple[str, float]], reached: float, light: str
+        self,
+        size: int,
+        periods: list[int],
+        limits: list[tuple[str, float]],
+        reached: float,
+        light: str,
     ) -> list[str]:
         wanted = self._situation.error
-        lines = [f"Checkers of {size} px, or a sinusoid of period {2 * size} px; {light}."]
+        lines = [f"Checkers of {size} px, or sinusoids of {_named(periods)}; {light}."]
         largest, error = limits[0]
         if reached > wanted:
             remedy = {
@@ -255,6 +284,11 @@ class Advice:
             lines.append(f"The wanted {wanted:.2%} is reached; the largest part is {largest}.")
         if "leakage" not in self._situation.known:
             lines.append("Leakage is taken as 0: run `umbra calibrate leak` first.")
+        if len(periods) > 1:
+            lines.append(
+                "Blur takes a part of a sinusoid's direct light: the second period measures it, as "
+                "`umbra calibrate leak` does once for all scans."
+            )
         if "tone" not in self._situation.known:
             lines.append("A sinusoid needs a linear projector: run `umbra calibrate tone`.")
         return lines
@@ -274,12 +308,18 @@ class _Images:
     noise: float
 
 
-def _images(noise: float, wanted: float) -> _Images:
+def _named(periods: list[int]) -> str:
+    several = "s" if len(periods) > 1 else ""
+    return f"period{several} {' and '.join(map(str, periods))} px"
+
+
+def _images(noise: float, wanted: float, periods: int) -> _Images:
     """For half of the wanted variance; the rest is left to the pattern."""
     part = wanted / 2**0.5
     checker = max(1, ceil((_CHECKER_SD * noise / part) ** 2))
     frames = max(3, ceil(_SINUSOID * (noise / part) ** 2))
-    average = ceil(frames / _MOST_PHASES)
-    phases = max(3, ceil(frames / average))
-    left = max(_CHECKER_SD * noise / checker**0.5, noise * (_SINUSOID / (phases * average)) ** 0.5)
+    average = ceil(frames / (_MOST_PHASES * periods))
+    phases = max(3, ceil(frames / (average * periods)))
+    taken = phases * average * periods
+    left = max(_CHECKER_SD * noise / checker**0.5, noise * (_SINUSOID / taken) ** 0.5)
     return _Images(checker, phases, average, left)

@@ -29,6 +29,7 @@ from daemon.separation.noise import TemporalNoise, noise_range
 from daemon.separation.order import Ranked
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
+from daemon.separation.registration import placed
 
 CELL = 8
 """Side of a cell, in pixels: its mean has an eighth of a pixel's noise."""
@@ -58,30 +59,40 @@ class Occluder:
         self._response = response
         self._alpha = lit_fraction
         self._references = References(response)
+        self._unused = 0
+        self._begin()
+
+    def _begin(self) -> None:
         self._low = Ranked(DARKEST, largest=False)
         self._high = Ranked(BRIGHTEST, largest=True)
         self._cell_low: Plane | None = None
         self._cell_high: Plane | None = None
-        self._pixel_noise = TemporalNoise(response.full_scale)
-        self._cell_noise = TemporalNoise(response.full_scale)
+        self._pixel_noise = TemporalNoise(self._response.full_scale)
+        self._cell_noise = TemporalNoise(self._response.full_scale)
         self._last: tuple[NDArray[Any], Plane] | None = None
-        self._unused = 0
+        self._moved = False  # the last frame was interpolated
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """See `Estimator`. Raises ValueError for an observation that cannot be respected."""
-        if observation.warp is not None:
-            raise ValueError("an occluder's frames are compared where they are: no warp")
+        """See `Estimator`."""
         if not observation.used:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
         else:
+            if observation.fresh:
+                self._unused += self._low.frames
+                self._begin()
+            moved = observation.warp is not None
+            if observation.warp is not None:
+                first = self._low.frames == 0
+                known = None if first else (self._high.planes[0], self._low.planes[0])
+                pixels = placed(pixels, observation.warp, bool(self._response.bayer), known)
             pixels = self._response.scaled(pixels, 1.0 / observation.strength)
             self._low.add(pixels)
             self._high.add(pixels)
-            self._watch(pixels)
+            self._watch(pixels, moved)
 
-    def _watch(self, pixels: NDArray[Any]) -> None:
+    def _watch(self, pixels: NDArray[Any], moved: bool) -> None:
         """Keep what tells of noise and of the shadow's way."""
         cells = _cells(pixels)
         sample = np.ascontiguousarray(pixels[::_SAMPLE, ::_SAMPLE])
@@ -91,9 +102,10 @@ class Occluder:
             np.minimum(self._cell_low, cells, out=self._cell_low)
             np.maximum(self._cell_high, cells, out=self._cell_high)
         if self._last is not None:
-            self._pixel_noise.add(self._last[0], sample)
+            interpolated = moved or self._moved
+            self._pixel_noise.add(self._last[0], sample, interpolated=interpolated)
             self._cell_noise.add(self._last[1], cells)
-        self._last = sample, cells
+        self._last, self._moved = (sample, cells), moved
 
     def result(self) -> Components:
         """See `Estimator`. Raises NotYet before two frames are in."""

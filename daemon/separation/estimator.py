@@ -37,8 +37,10 @@ class Observation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     weight: float = 1.0
     strength: float = 1.0  # of the source in this frame, relative to the run's reference
     warp: tuple[float, ...] | None = None  # 2x3 affine, row by row: frame -> reference
+    fresh: bool = False  # the collection begins anew with this frame: none before it is used
     delay_us: float = 0.0  # of the exposure's start, after the light was said to be the pattern's
     exposure_us: float = 0.0  # as the device gave it; 0: unknown
+    exposure: float = 1.0  # of a bracket: as it was asked for, of the run's own
 
 
 class Quality(enum.IntFlag):
@@ -46,7 +48,7 @@ class Quality(enum.IntFlag):
 
     SATURATED = 1 << 0  # a sample at the end of the camera's scale: components are too small
     DARK = 1 << 1  # not told from no light at all
-    LOW_MODULATION = 1 << 2  # direct not told from noise
+    LOW_MODULATION = 1 << 2  # direct not told from noise, or at an edge of two images
     NEVER_LIT = 1 << 3  # no frame with the source in full: direct is not known (NaN)
     NEVER_UNLIT = 1 << 4  # no frame in shadow: direct and global cannot be told apart (NaN)
     NEGATIVE = 1 << 5  # a component below zero by more than noise
@@ -124,8 +126,9 @@ class Estimator(Protocol):
     """Frames in, components (or a measurement) out."""
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """Take in one frame, (H, W) or (H, W, 3), uint8 or uint16; `pixels` is only read, and not
-        kept. Unused observations are counted, not more."""
+        """Take in one frame, (H, W) or (H, W, 3), uint8 or uint16 (float32 light where the response
+        is a `bracket.Radiance`); `pixels` is only read, and not kept. Unused observations are
+        counted, not more."""
         ...
 
     def result(self) -> Result:

@@ -13,12 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import light_model
-from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import Judgement, finish
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import Judgement, bits, finish
+from daemon.separation.handedness import WaveSums
 from daemon.separation.order_model import extremes
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
+from daemon.separation.residue import NOT_SHIFTS, of_shifts
 from daemon.separation.scan_noise import ScanNoise
+from daemon.separation.steadiness import HALF, compare
 
 
 class MaxMin:
@@ -27,7 +30,7 @@ class MaxMin:
     With `average` > 1 the frames of each pattern are averaged in linear light before they are
     compared; a pattern counts once its last frame is in. `levels` is as for `TopK`: with it the
     planes `direct_std`, `global_std` and the bias of noise are stated (at sharp patterns), which
-    is not taken off.
+    is not taken off. With `weights` (of `handedness.WaveSums`) a mirror is found.
     """
 
     def __init__(
@@ -38,7 +41,9 @@ class MaxMin:
         leakage: float,
         average: int = 1,
         levels: Callable[[float], Plane] | None = None,
+        weights: NDArray[np.complex128] | None = None,
     ) -> None:
+        self._waves = None if weights is None else WaveSums(weights)
         self._extremes = None if levels is None else extremes(levels(0.0))
         self._average_of = average
         self._response = response
@@ -69,7 +74,7 @@ class MaxMin:
             if observation.used:
                 if self._max is None:
                     self._noise.add(pixels, observation.pattern)
-                self._compare(pixels)
+                self._compare(pixels, observation.pattern)
             else:
                 self._unused += 1
             return
@@ -91,12 +96,14 @@ class MaxMin:
             self._close(mean)
 
     def _close(self, mean: FrameMean) -> None:
-        if mean.frames:
-            self._compare(mean.value())
+        if mean.frames and self._open is not None:
+            self._compare(mean.value(), self._open)
         mean.clear()
         self._open = None
 
-    def _compare(self, samples: NDArray[Any]) -> None:
+    def _compare(self, samples: NDArray[Any], pattern: int) -> None:
+        if self._waves is not None:
+            self._waves.add(samples, pattern)
         if self._max is None or self._min is None:
             self._max, self._min = samples.copy(), samples.copy()
         else:
@@ -118,6 +125,19 @@ class MaxMin:
             lit, unlit = brightest - ambient, darkest - ambient
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
         planes, bias = self._stated(brightest, darkest)
+        deviation = self._noise.deviation(brightest)
+        moved: NDArray[np.uint16] | None = None
+        steady: dict[str, Any] = {}
+        advice: list[str] = []
+        if abs(self._alpha - 0.5) < HALF:
+            middle = (brightest + darkest) * np.float32(0.5)
+            moved, steady, advice = compare(
+                self._references, middle, deviation, self._leakage, ranked=True
+            )
+        mirrored, told, as_declared = of_shifts(self._waves, deviation)
+        flags = np.zeros(direct.shape[:2], dtype=np.uint16) if moved is None else moved
+        if mirrored is not None:
+            flags |= bits(mirrored, Quality.RESIDUE)
         return finish(
             direct,
             indirect,
@@ -125,7 +145,8 @@ class MaxMin:
             response=self._response,
             brightest=brightest,
             saturated=saturated,
-            judgement=Judgement.of_extremes(self._noise.deviation(brightest), self._patterns),
+            flags=flags,
+            judgement=Judgement.of_extremes(deviation, self._patterns),
             facts={
                 "estimator": "maxmin",
                 "patterns": self._patterns,
@@ -134,6 +155,9 @@ class MaxMin:
                 "leakage": self._leakage,
                 "noise_from": self._noise.source,
                 **bias,
+                **told,
+                **steady,
+                "advice": ([] if as_declared else [NOT_SHIFTS]) + advice,
                 **self._references.facts(source),
             },
         )

@@ -20,10 +20,16 @@ DEVIATIONS = frozenset({"direct_std", "global_std"})
 """Planes that have a component's shape."""
 
 ADVICE: dict[Quality, tuple[float, str]] = {
+    Quality.LOW_MODULATION: (
+        0.9,
+        "of the pixels show no pattern that is told from noise, so that no direct light is: see "
+        "that the source lights what the camera sees, in focus, and each frame is its pattern's",
+    ),
     Quality.SATURATED: (
         0.005,
         "of the pixels are saturated, and their components too small: expose more briefly "
-        "(--exposure) or lower the gain",
+        "(of a scan: --exposure), lower the gain, or bracket exposures of patterns "
+        "(--bracket 0.25,1)",
     ),
     Quality.NEGATIVE: (
         0.02,

@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import SIGNIFICANT, Judgement, finish
+from daemon.separation.coordinates import mirrored_coordinates
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
+from daemon.separation.frameset import PairSums
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
@@ -27,6 +29,13 @@ FINE = 4
 
 _KEPT = 0.95
 """A stripe resolves a pixel that has at least this part of the best contrast."""
+
+
+_SEEN = 2
+"""The bit by whose stripes, 8 px wide, a mirror's finer ones are told."""
+
+_DIRECT = 0.25
+"""Of the light: with less that is direct, a pixel's coordinate says nothing of mirrors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +74,7 @@ class GrayCodeDecoder:
         self._whole: Plane | None = None  # sum of P + I over all pairs
         self._brightest: Plane | None = None
         self._pairs = 0
+        self._sums = PairSums()
         self._saturated: NDArray[np.bool_] | None = None
         self._unused = 0
 
@@ -113,6 +123,7 @@ class GrayCodeDecoder:
         self._codes[image.axis].add(image.bit, _grey(difference))
         if image.bit < FINE:
             self._difference[key] = difference
+        self._sums.add(whole)
         brighter = np.maximum(shown, inverse)
         if self._whole is None or self._brightest is None:
             self._whole, self._brightest = whole, brighter
@@ -136,20 +147,29 @@ class GrayCodeDecoder:
         total = self._references.total(half, b)
         moved, steady, advice = compare(self._references, half, deviation, b)
         indirect: Plane = total.light - direct
-        direct_std = deviation * np.float32(np.sqrt(2.0) / (1.0 - b))
-        share = np.asarray(
-            total.of_half * np.float32(0.5 / self._pairs) + total.of_frame * self._average,
-            dtype=np.float32,
-        )
-        global_std: Plane = np.sqrt(direct_std**2 + deviation**2 * share)
+        step = contrast * np.float32(0.5)
+        pair_var = np.square(self._noise.deviation(half + step))
+        pair_var += np.square(self._noise.deviation(half - step))
+        direct_std: Plane = np.sqrt(pair_var) * np.float32(1.0 / (1.0 - b))
+        global_var = total.of_references(self._noise.deviation) * np.float32(self._average)
+        global_var += pair_var * np.asarray(total.of_half * (0.25 / self._pairs), np.float32)
+        global_std: Plane = np.sqrt(direct_std**2 + global_var)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": direct_std,
             "global_std": global_std,
             "stripe": stripe,
         }
-        limit = np.float32(SIGNIFICANT) * _grey(deviation)
-        for axis, code in self._codes.items():
-            planes["column" if axis == "x" else "row"] = code.decode(limit)
+        coordinates = self.coordinates(np.float32(SIGNIFICANT) * _grey(deviation))
+        planes.update(coordinates)
+        told = mirrored_coordinates(
+            coordinates,
+            self._strength(contrast, pair, deviation),
+            self._stripes(),
+        )
+        sums, unequal = self._sums.told(float(np.median(deviation)))
+        flags = bits(told.mirrored, Quality.RESIDUE)
+        if moved is not None:
+            flags |= moved
         return finish(
             direct,
             indirect,
@@ -161,7 +181,7 @@ class GrayCodeDecoder:
                 total=np.float32(SIGNIFICANT) * global_std,
                 deviation=deviation,
             ),
-            flags=moved,
+            flags=flags,
             planes=planes,
             facts={
                 "estimator": "finest stripes",
@@ -176,9 +196,32 @@ class GrayCodeDecoder:
                 },
                 **self._references.facts(total.source),
                 **steady,
-                "advice": advice,
+                **told.facts,
+                **sums,
+                "advice": unequal + told.advice + advice,
             },
         )
+
+    def coordinates(self, limit: Plane) -> dict[str, Plane]:
+        """`column` and `row` (H, W) in projector pixels, as far as they are coded; NaN where a
+        coarse stripe differs from its inverse by less than `limit` (H, W, linear counts)."""
+        return {
+            "column" if axis == "x" else "row": code.decode(limit)
+            for axis, code in self._codes.items()
+        }
+
+    def _strength(self, contrast: Plane, pair: Plane, deviation: Plane) -> Plane:
+        """Contrast of the stripes by its noise; 0 where little light is direct, for there the
+        coarse bits were told by global light."""
+        strong = _grey(contrast) / np.maximum(_grey(deviation), np.float32(1e-6))
+        return np.where(_grey(contrast) > np.float32(_DIRECT) * _grey(pair), strong, np.float32(0))
+
+    def _stripes(self) -> Plane | None:
+        """P - I of the stripes of each axis that are fine and yet resolved, multiplied."""
+        found = [_grey(d) for key, d in self._difference.items() if key[1] == _SEEN]
+        if len(found) < len(self._codes):
+            return None
+        return found[0] if len(found) == 1 else np.sign(found[0]) * found[1]
 
     def _finest(self, deviation: Plane) -> tuple[Plane, NDArray[np.uint16]]:
         """|P - I| of the finest stripes that keep their contrast, and their width (H, W)."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation import blur
 from daemon.separation.contrast import CheckerContrast
 from daemon.separation.estimator import (
     Curve,
@@ -24,8 +25,6 @@ _RESOLVED = 0.5
 _DIRECT = 0.25
 """Of the light, at least this part must be direct where contrast is measured."""
 _SURE = 0.05
-_BLURRED = 4
-"""Contrast up to this size tells the blur: that of larger patches is lost to local scattering."""
 
 
 class Leak:
@@ -107,7 +106,8 @@ class Leak:
         rows = [self._of_size(size, b, b_sd) for size in sorted(self._sizes)]
         measured = [row for row in rows if row["measurable"]]
         plateau = next((row["size"] for row in measured if row["leakage"] - b < 0.02), None)
-        blur = blur_of({row["size"]: row["contrast"] for row in rows})
+        contrast = {row["size"]: row["contrast"] for row in rows}
+        of_image, of_optics = blur.of_image(contrast), blur.of_optics(contrast)
         advice = []
         lost = [str(row["size"]) for row in rows if not row["measurable"]]
         if lost:
@@ -123,18 +123,21 @@ class Leak:
             "values": {
                 "leakage": round(max(b, 0.0), 5),
                 "leakage_sd": round(b_sd, 5),
-                "blur_px": blur,
+                "blur_px": of_image,
+                "optics_blur_px": of_optics,
                 "leakage_by_size": [[row["size"], row["leakage"], row["sd"]] for row in measured],
             },
             "leakage": round(b, 5),
             "leakage_sd": round(b_sd, 5),
-            "blur_px": blur,
+            "blur_px": of_image,
+            "optics_blur_px": of_optics,
             "by_size": rows,
             "plateau_from_px": plateau,
             "figures": [
                 ["leakage b", f"{b:.4f} ± {b_sd:.4f}"],
                 ["holds for patches from", "no size" if plateau is None else f"{plateau} px"],
                 ["cannot be measured for", f"{', '.join(lost)} px" if lost else "none"],
+                ["blur of the optics", f"{of_optics:.2f} px" if of_optics else "not seen"],
             ],
             "advice": advice,
         }
@@ -174,34 +177,3 @@ class Leak:
     def summary(self) -> dict[str, float]:
         """Sizes so far."""
         return {"sizes": float(len(self._contrast))}
-
-
-def blur_of(contrast: dict[int, float]) -> float:
-    """The blur, as a Gaussian's sigma in projector pixels, that leaves checkers these contrasts.
-
-    Checkers are drawn, blurred, and sampled with linear interpolation at places all over a pixel,
-    each at the integer shift at which its contrast is greatest; the median over places is compared
-    with what was measured, as it was measured.
-    """
-    told = {size: value for size, value in contrast.items() if size <= _BLURRED}
-    sigmas = np.arange(0.0, 3.0, 0.02)
-    errors = [
-        sum((_contrast_left(size, sigma) - value) ** 2 for size, value in told.items())
-        for sigma in sigmas
-    ]
-    return round(float(sigmas[int(np.argmin(errors))]), 3) if told else 0.0
-
-
-def _contrast_left(size: int, sigma: float) -> float:
-    """Of checkers of a size, at the median of all places in a pixel."""
-    x = np.arange(-32 * size, 32 * size)
-    wave = np.where((x // size) % 2 == 0, 1.0, -1.0)
-    if sigma > 0:
-        reach = int(4 * sigma) + 1
-        kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-        wave = np.convolve(wave, kernel / kernel.sum(), mode="same")
-    shifts = np.arange(0, size, max(1, size // 4))
-    places = np.linspace(-0.5, 0.5, 11)
-    seen = np.interp(places[:, None] + shifts[None, :], x, wave)
-    greatest = np.abs(seen).max(axis=1)
-    return float(np.median(greatest[:, None] * greatest[None, :]))

@@ -25,6 +25,7 @@ from daemon.separation.noise import Noise, TemporalNoise
 from daemon.separation.plateau import WHOLE, Part, Plateaus
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
+from daemon.separation.registration import placed
 
 LEAST_MODULATION = 0.05
 """A smaller part of the light comes and goes with interreflection while the mesh moves."""
@@ -59,27 +60,37 @@ class MeshOccluder:
         self._beta = hole_fraction
         self._averaged = averaged
         self._references = References(response)
+        self._unused = 0
+        self._begin()
+
+    def _begin(self) -> None:
         self._plateaus = Plateaus()
-        self._noise = TemporalNoise(response.full_scale, _STILL)
+        self._noise = TemporalNoise(self._response.full_scale, _STILL)
         self._table: Plane | None = None
         self._mean: NDArray[np.float64] | None = None  # of the sampled pixels' linear light
         self._last: NDArray[Any] | None = None
-        self._unused = 0
+        self._moved = False  # the last frame was interpolated
         self._followed = 0  # frames when coverage was last looked at
         self._share = 0.0
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """See `Estimator`. Raises ValueError for an observation that cannot be respected."""
-        if observation.warp is not None:
-            raise ValueError("an occluder's frames are compared where they are: no warp")
+        """See `Estimator`."""
         if not observation.used:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
         else:
-            self._take(self._response.scaled(pixels, 1.0 / observation.strength))
+            if observation.fresh and self._last is not None:
+                self._unused += self._plateaus.frames
+                self._begin()
+            moved = observation.warp is not None
+            if observation.warp is not None:
+                high, low = self._plateaus.high, self._plateaus.low
+                known = (high.extreme, low.extreme) if self._plateaus.frames else None
+                pixels = placed(pixels, observation.warp, bool(self._response.bayer), known)
+            self._take(self._response.scaled(pixels, 1.0 / observation.strength), moved)
 
-    def _take(self, pixels: NDArray[Any]) -> None:
+    def _take(self, pixels: NDArray[Any], moved: bool) -> None:
         part = self._sampled(_SAMPLE)
         sample = pixels[part]
         light = self._response.linear(sample).astype(np.float64)
@@ -87,9 +98,10 @@ class MeshOccluder:
             self._mean = light
             self._last = pixels.copy()
         else:
-            self._noise.add(self._last[part], sample)
+            self._noise.add(self._last[part], sample, interpolated=moved or self._moved)
             self._mean += light
             self._last[...] = pixels
+        self._moved = moved
         frames = self._plateaus.frames + 1
         if frames & (frames - 1) == 0 and (noise := self._sensor()) is not None:
             self._table = self._deviations(noise)

@@ -28,6 +28,7 @@ _ENOUGH = 200  # differences that make a level's deviation
 _SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 _SECOND_DIFFERENCE_NORM = 6.0  # what it makes of independent samples of deviation 1
 _BLOCK = 16
+_QUIET = 0.91  # of pure noise, what the quietest fifth of such blocks has
 _BLOCKS = 12  # blocks that make a level's deviation
 
 
@@ -84,11 +85,13 @@ class TemporalNoise:
         self._quantile = quantile
         self._scale = 1.0 / NormalDist().inv_cdf(0.5 + quantile / 2.0)
         self._table = np.zeros((_LEVELS, _BINS), dtype=np.int64)
+        self._smoothed = np.zeros_like(self._table)  # of pairs with an interpolated frame
         self.pairs = 0
 
-    def add(self, one: NDArray[Any], other: NDArray[Any]) -> None:
+    def add(self, one: NDArray[Any], other: NDArray[Any], *, interpolated: bool = False) -> None:
         """Take in two frames of one shape (uint8, uint16 or float32 counts). Copies of one frame,
-        as in slowed-down videos, say nothing and are left out."""
+        as in slowed-down videos, say nothing and are left out. Interpolation smooths noise away:
+        pairs with an `interpolated` frame speak only where there are no others."""
         difference = np.abs(one.astype(np.float32) - other)
         if not difference.any():
             return
@@ -96,13 +99,14 @@ class TemporalNoise:
         size = np.minimum(np.log2(1.0 + difference) * _PER_OCTAVE, _BINS - 1)
         flat = level.astype(np.intp) * _BINS + size.astype(np.intp)
         counted = np.bincount(flat.reshape(-1), minlength=_LEVELS * _BINS)
-        self._table += counted.reshape(_LEVELS, _BINS)
+        table = self._smoothed if interpolated else self._table
+        table += counted.reshape(_LEVELS, _BINS)
         self.pairs += 1
 
     def noise(self) -> Noise | None:
         """The deviation by level, never less than the rounding of counts; None for want of data."""
         levels, deviations = [], []
-        for index, row in enumerate(self._table):
+        for index, row in enumerate(self._table if self._table.any() else self._smoothed):
             if row.sum() < _ENOUGH:
                 continue
             found = self._scale * _difference(row, self._quantile) / np.sqrt(2.0)
@@ -155,7 +159,7 @@ def from_picture(counts: Plane, full_scale: int, step: int = 1) -> Noise:
     order = np.argsort(level, kind="stable")
     levels, deviations = [], []
     for group in np.array_split(order, min(max(order.size // _BLOCKS, 1), 8)):
-        quiet = float(np.quantile(spread[group], 0.2)) * _MAD / _SECOND_DIFFERENCE_NORM
+        quiet = float(np.quantile(spread[group], 0.2)) * _MAD / _SECOND_DIFFERENCE_NORM / _QUIET
         levels.append(float(np.mean(level[group])))
         deviations.append(max(quiet, _ROUNDING))
     return Noise(tuple(levels), tuple(deviations))

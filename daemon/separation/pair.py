@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import light_model
-from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import Judgement, finish
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
 from daemon.separation.steadiness import compare
+from daemon.separation.straddling import Straddling
 
 
 class ComplementPair:
@@ -67,13 +68,21 @@ class ComplementPair:
             self._references, (first + second) * np.float32(0.5), deviation, self._leakage
         )
         direct, indirect = light_model.from_complement_pair(lit, unlit, self._alpha, self._leakage)
+        pattern = Straddling.of_pair(
+            lit, unlit, self._alpha, self._leakage, deviation, self._response.bayer
+        )
+        flags = bits(pattern.straddling, Quality.LOW_MODULATION)
+        if pattern.mirrored is not None:
+            flags |= bits(pattern.mirrored, Quality.RESIDUE)
+        if moved is not None:
+            flags |= moved
         return finish(
             direct,
             indirect,
             response=self._response,
             brightest=brightest,
             saturated=self._saturated,
-            flags=moved,
+            flags=flags,
             planes=self._deviations(deviation, self._noise.deviation(np.minimum(first, second))),
             judgement=Judgement.of_extremes(deviation, 2),
             facts={
@@ -85,6 +94,7 @@ class ComplementPair:
                 "noise_from": self._noise.source,
                 **self._references.facts(source),
                 **steady,
+                **pattern.facts,
                 **self._residual(first, second),
                 "advice": advice,
             },
@@ -96,14 +106,17 @@ class ComplementPair:
         b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
         h = light_model.global_weight(1.0 - self._alpha, b)
         singular = min(light_model.complement_determinants(self._alpha, b))
-        ambient = 0.0  # of its variance in one frame's, in L_g = (I_unlit - A - b(I_lit - A))/det
+        unlit_var = np.square(least)  # in L_g = (I_unlit - A - b(I_lit - A))/det
         for kind in (Lighting.AMBIENT, Lighting.BLACK):
-            if not ambient and self._references.frames(kind):
-                ambient = self._average * (1.0 - b) ** 2 / self._references.frames(kind)
+            reference = self._references.mean(kind)
+            if reference is not None:
+                share = self._average * (1.0 - b) ** 2 / self._references.frames(kind)
+                unlit_var += np.square(self._noise.deviation(reference)) * np.float32(share)
+                break
         return {
             "direct_std": np.hypot(most * np.float32(h), least * np.float32(g))
             * np.float32(1.0 / singular),
-            "global_std": np.hypot(most * np.float32(b), least * np.float32(np.sqrt(1.0 + ambient)))
+            "global_std": np.sqrt(unlit_var + np.square(most * np.float32(b)))
             * np.float32(1.0 / singular),
         }
 

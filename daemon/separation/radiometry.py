@@ -96,6 +96,13 @@ class Response:
         """Linear light of each count from 0 to full scale."""
         return _table(self.full_scale, self.black, self.tone)[: self.full_scale + 1]
 
+    def slope(self, counts: NDArray[Any]) -> Plane:
+        """Linear light that one count more stands for, at a level of encoded counts: float32."""
+        if self.is_linear:
+            return np.ones(np.shape(counts), dtype=np.float32)
+        slopes: Plane = np.take(_slopes(self), _whole(counts, self.full_scale), mode="clip")
+        return slopes
+
     def deviation(self, noise: Noise | None, counts: NDArray[Any]) -> Plane:
         """Standard deviation of linear light at a level of encoded counts: float32, same shape.
 
@@ -104,9 +111,17 @@ class Response:
         if noise is None:
             noise = Noise((0.0, float(self.full_scale)), (12.0**-0.5,) * 2)
         table = _deviations(self, noise)
-        if counts.dtype.kind != "u":  # noise is smooth: the nearest count is near enough
-            counts = np.clip(counts, 0, self.full_scale).astype(np.uint16)
-        return np.take(table, counts, mode="clip")
+        found: Plane = np.take(table, _whole(counts, self.full_scale), mode="clip")
+        return found
+
+    def wave_deviations(
+        self, noise: Noise | None, mean: Plane, amplitude: Plane
+    ) -> tuple[Plane, Plane]:
+        """Standard deviations of linear light over the phases of a sinusoid, as a mean and as its
+        wave meets them: float32. Noise that grows evenly with light is that of the mean."""
+        del amplitude
+        even = self.deviation(noise, self.counts(mean))
+        return even, even
 
 
 def decode(encoded: NDArray[np.float64], tone: str) -> NDArray[np.float64]:
@@ -148,11 +163,24 @@ def _table(full_scale: int, black: float, tone: str) -> Plane:
     return table
 
 
+def _whole(counts: NDArray[Any], full_scale: int) -> NDArray[Any]:
+    """Counts as an index: noise and tone curves are smooth, the nearest is near enough."""
+    if counts.dtype.kind == "u":
+        return counts
+    whole: NDArray[np.uint16] = np.clip(counts, 0, full_scale).astype(np.uint16)
+    return whole
+
+
+@lru_cache(maxsize=16)
+def _slopes(response: Response) -> Plane:
+    """Linear light a count for every count up to full scale."""
+    return np.asarray(np.gradient(response.table()), dtype=np.float32)
+
+
 @lru_cache(maxsize=16)
 def _deviations(response: Response, noise: Noise) -> Plane:
     """Deviation of linear light for every count up to full scale."""
-    slope = np.gradient(response.table())
-    return noise.deviation(np.arange(response.full_scale + 1)) * slope.astype(np.float32)
+    return noise.deviation(np.arange(response.full_scale + 1)) * _slopes(response)
 
 
 class FrameMean:

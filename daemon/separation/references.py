@@ -17,12 +17,22 @@ from daemon.separation.radiometry import FrameMean, Plane, Response
 @dataclass(frozen=True, slots=True)
 class Total:
     """L_d + L_g, and what the variance of light under half of the source and of one frame makes of
-    its variance, as factors (one for all, or one a sample)."""
+    its variance, as factors (one for all, or one a sample); `frames` are the references that it
+    holds: their light and their factors."""
 
     light: Plane
     of_half: float | Plane
     of_frame: float | Plane
     source: str
+    frames: tuple[tuple[Plane, float | Plane], ...] = ()
+
+    def of_references(self, deviation: Callable[[Plane], Plane]) -> Plane:
+        """The variance that the references bring, each with the noise of its own light:
+        `deviation` is that of one frame at a level of light."""
+        found = np.zeros_like(self.light)
+        for light, factor in self.frames:
+            found += np.square(deviation(light)) * np.asarray(factor, dtype=np.float32)
+        return found
 
 
 class References:
@@ -64,7 +74,13 @@ class References:
         if off is not None:
             weight = 2.0 / (1.0 + leakage)
             share = weight**2 / self.frames(Lighting.AMBIENT)
-            return Total((half - off) * np.float32(weight), weight**2, share, "ambient frame")
+            return Total(
+                (half - off) * np.float32(weight),
+                weight**2,
+                share,
+                "ambient frame",
+                ((off, share),),
+            )
         if black is None:
             weight = 2.0 / (1.0 + leakage)
             return Total(half * np.float32(weight), weight**2, 0.0, "none")
@@ -73,7 +89,7 @@ class References:
         share = weight**2 / self.frames(Lighting.BLACK)
         whole = self.whole(leakage)
         if whole is None or self._white_saturated is None:
-            return Total(total, weight**2, share, "black frame")
+            return Total(total, weight**2, share, "black frame", ((black, share),))
         if self._white_saturated.any():
             clipped = self._white_saturated
             return Total(
@@ -81,6 +97,10 @@ class References:
                 np.where(clipped, np.float32(weight**2), np.float32(whole.of_half)),
                 np.where(clipped, np.float32(share), np.float32(whole.of_frame)),
                 whole.source,
+                (
+                    (black, np.where(clipped, share, whole.frames[0][1])),
+                    (whole.frames[1][0], np.where(clipped, 0.0, whole.frames[1][1])),
+                ),
             )
         return whole
 
@@ -91,9 +111,12 @@ class References:
         if black is None or white is None:
             return None
         light: Plane = (white - black) * np.float32(1.0 / (1.0 - leakage))
-        frames = 1.0 / self.frames(Lighting.BLACK) + 1.0 / self.frames(Lighting.WHITE)
-        share = frames / (1.0 - leakage) ** 2
-        return Total(light, 0.0, share, "black and white frames")
+        of_black, of_white = (
+            1.0 / self.frames(kind) / (1.0 - leakage) ** 2
+            for kind in (Lighting.BLACK, Lighting.WHITE)
+        )
+        frames = (black, of_black), (white, of_white)
+        return Total(light, 0.0, of_black + of_white, "black and white frames", frames)
 
     @property
     def white_saturated(self) -> NDArray[np.bool_] | None:

@@ -135,7 +135,7 @@ def by_level(response: Response, light: Plane, variance: Plane, freedom: int) ->
     a χ² distribution's median is below its mean by (1 - 2/9f)³.
     """
     counts = response.counts(light)
-    slope = response.deviation(None, counts) * np.float32(12.0**0.5)
+    slope = response.slope(counts)
     groups = np.array_split(np.argsort(counts, kind="stable"), min(counts.size // _ENOUGH, _LEVELS))
     levels, deviations = [], []
     for group in groups if counts.size >= _ENOUGH else ():

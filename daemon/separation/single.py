@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -9,12 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import light_model
-from daemon.separation.estimator import Components, Lighting, NotYet, Observation
-from daemon.separation.finish import Judgement, finish
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.fineness import astray
+from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.noise import from_frame
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
+from daemon.separation.steadiness import leaks
 
+_ASTRAY = 1.5  # times the change across stripes: along them there is no more
+_OFF = 0.1  # of the light: peaks and valleys are off by less for blur and noise
+_HALF = 0.1  # lit fractions so near to a half have their middle at ½(W + K)
 _PEAK = 0.82 * 0.9
 """Deviation of a row's peaks in a square over a pixel's: a peak is the larger of two pixels as
 bright, and light interpolated between peaks is the mean of more than one."""
@@ -106,12 +112,9 @@ class PeaksAndValleys:
         saturated = self._reduced(self._saturated.astype(np.float32)) > 0
         deviation = self._deviation(picture, brightest)
         planes = self._stated(deviation, self._deviation(picture, darkest))
-        plain = Response(
-            self._response.full_scale,
-            self._response.black,
-            self._response.tone,
-            self._response.saturation,
-        )
+        mirrored = self._mirrored(picture)
+        told = self._told(picture, brightest, darkest)
+        plain = replace(self._response, bayer="")
         return finish(
             direct,
             indirect,
@@ -119,6 +122,7 @@ class PeaksAndValleys:
             response=plain,
             brightest=brightest,
             saturated=saturated,
+            flags=None if mirrored is None else bits(mirrored, Quality.RESIDUE),
             judgement=Judgement.of_extremes(deviation, self._window * self._along),
             facts={
                 "estimator": "peaks and valleys",
@@ -128,6 +132,8 @@ class PeaksAndValleys:
                 "leakage": self._leakage,
                 "reduced_by": self._reduce,
                 "noise_from": "one picture",
+                "mirrors_looked_for": mirrored is not None,
+                **told,
                 **self._references.facts(source),
             },
         )
@@ -135,6 +141,54 @@ class PeaksAndValleys:
     def summary(self) -> dict[str, float]:
         """Images separated, and frames not used."""
         return {"images": float(self._images), "unused": float(self._unused)}
+
+    def _told(self, picture: Plane, lit: Plane, unlit: Plane) -> dict[str, Any]:
+        """Whether the picture can be that of the stripes, and of the scene of black and white."""
+        lines = []
+        step = 2 if self._response.bayer else 1  # to the next sample of a colour
+        along, across = (
+            float(np.mean(np.abs(np.diff(picture[::step, ::step], axis=axis)), dtype=np.float64))
+            for axis in ((0, 1) if self._across == "x" else (1, 0))
+        )
+        if along > _ASTRAY * across:
+            other = "y" if self._across == "x" else "x"
+            lines.append(
+                f"light changes {along / max(across, 1e-6):.1f} times more along the stripes than "
+                f"across them: they are those of the other axis (--axis {other})"
+            )
+        facts: dict[str, Any] = {"change_along": round(along / max(across, 1e-6), 4)}
+        black = self._references.mean(Lighting.BLACK)
+        white = self._references.mean(Lighting.WHITE)
+        if black is not None and white is not None and abs(self._alpha - 0.5) < _HALF:
+            expected = self._reduced(white + black)
+            ratio = float(np.median((lit + unlit) / np.maximum(expected, np.float32(1e-3))))
+            facts["mean_ratio"] = round(ratio, 4)
+            if abs(ratio - 1.0) > _OFF:
+                lines.append(
+                    f"peaks and valleys have {ratio:.2f} of the light of white and black, not 1: "
+                    "the camera's tone curve is not the one given (--tone), or light or scene "
+                    "changed since the black and white frames"
+                )
+            else:
+                lines += leaks(self._references, self._leakage)
+        return {**facts, "advice": lines}
+
+    def _mirrored(self, picture: Plane) -> NDArray[np.bool_] | None:
+        """Where the stripes run astray, at the lower resolution; None without black and white
+        frames, which take the scene's own texture out."""
+        black = self._references.mean(Lighting.BLACK)
+        white = self._references.mean(Lighting.WHITE)
+        if black is None or white is None or abs(self._alpha - 0.5) > _HALF:
+            return None
+        step, lit = white - black, picture - (white + black) * np.float32(0.5)
+        noise = self._deviation(picture, white) * np.float32(1.5**0.5)  # of the picture, ½(W + K)
+        if lit.ndim == 3:
+            step, lit = step.sum(axis=2), lit.sum(axis=2)
+            noise = np.sqrt(np.square(noise).sum(axis=2))
+        wave: Plane = lit / np.maximum(step * np.float32(0.5), noise)
+        strong: Plane = np.abs(lit) / np.maximum(noise, np.float32(1e-6))
+        found = astray(wave, strong, self._across)
+        return None if found is None else block_mean(found.astype(np.float32), self._reduce) > 0.5
 
     def _stated(self, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
         """Deviations of the components from those of one pixel's peaks and valleys.

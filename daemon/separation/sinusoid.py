@@ -9,18 +9,23 @@ whichever are missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import log
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import correspondence
+from daemon.separation.blur import of_wave
+from daemon.separation.coordinates import other_axis
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
-from daemon.separation.handedness import reversed_pattern, strength
+from daemon.separation.handedness import STRONG, strength
 from daemon.separation.noise import Noise
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
+from daemon.separation.residue import mirrored
+from daemon.separation.ripple import ripple
 from daemon.separation.scan_noise import ResidualNoise
 from daemon.separation.steadiness import compare
 
@@ -38,6 +43,7 @@ _MISFIT = 5.0
 _DOUBTFUL = 2.0
 """Above this it is none where it is also a part of the wave: ..."""
 _DISTORTED = 0.05
+_RIPPLED = 0.03  # of the wave: with more of it in mean or amplitude, light was no sinusoid
 _MANY = 0.2  # of the pixels
 
 
@@ -46,7 +52,8 @@ class LeastSquares:
 
     `phases[i]` is pattern i's (frequency, δ in radians). Planes: `direct_std`, `global_std` (as the
     components), `phase` (H, W) in 0..2π of the first frequency, and `column` or `row` (H, W) in
-    projector pixels where `periods` say how to get it.
+    projector pixels where `periods` say how to get it. `blur_px`: the optics' as calibrated, for
+    where the frames do not tell it.
     """
 
     def __init__(
@@ -59,6 +66,7 @@ class LeastSquares:
         size: int | None = None,
         weave: float = 0.0,
         axis: str = "x",
+        blur_px: float | None = None,
     ) -> None:
         self._response = response
         self._phases = tuple(phases)
@@ -67,6 +75,7 @@ class LeastSquares:
         self._size = size
         self._weave = weave
         self._axis = axis
+        self._known_blur = blur_px
         self._references = References(response)
         self._fits = [_Fit() for _ in range(1 + max(f for f, _ in phases))]
         self._noise = ResidualNoise(response)
@@ -97,18 +106,20 @@ class LeastSquares:
         if not ready or self._saturated is None:
             raise NotYet("a sinusoid needs 3 phases; they have not all come yet")
         noise = self._noise.noise()
-        blur = self._blur(ready)
+        blur, blur_from = self._blur(ready)
         solved = [
             self._separate(fit, noise, gain)
-            for fit, gain in zip(ready, self._gains(blur, len(ready)), strict=True)
+            for fit, gain in zip(ready, self._gains(blur), strict=False)
         ]
         direct, indirect, direct_var, global_var = _combine(solved)
         brightest = np.maximum.reduce([fit.brightest() for fit in ready])
         quality = np.zeros(direct.shape[:2], dtype=np.uint16)
         if len(solved) > 1:
             quality |= bits(_disagree(solved), Quality.DISAGREE)
-        if self._periods:
-            quality |= bits(self._mirrored(ready[0], noise), Quality.RESIDUE)
+        reflected, told = self._mirrored(ready[0], noise)
+        rippled = self._ripple(ready, noise)
+        if reflected is not None:
+            quality |= bits(reflected, Quality.RESIDUE)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": np.sqrt(direct_var),
             "global_std": np.sqrt(global_var),
@@ -127,6 +138,7 @@ class LeastSquares:
             "patterns": sum(fit.frames for fit in self._fits),
             "frequencies": len(ready),
             "blur_px": None if blur is None else round(blur, 3),
+            "blur_from": blur_from,
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
@@ -134,10 +146,15 @@ class LeastSquares:
             **self._references.facts(
                 self._references.total(ready[0].solve()[0], self._leakage).source
             ),
-            "mirrors_looked_for": bool(self._periods),
+            **told,
             **steady,
             "misfit": None if misfit is None else round(misfit, 3),
-            "advice": _advice(misfit, self._noise.distortion, disagreeing) + advice,
+            "ripple": None if rippled is None else round(rippled, 4),
+            "advice": [
+                *_advice(misfit, self._noise.distortion, disagreeing, rippled),
+                *other_axis({n: planes[n] for n in ("column", "row") if n in planes}),
+                *advice,
+            ],
         }
         return finish(
             direct,
@@ -163,16 +180,17 @@ class LeastSquares:
             "unused": float(self._unused),
         }
 
-    def _blur(self, ready: list[_Fit]) -> float | None:
-        """The blur of projector and camera together, in projector pixels; None from one period.
+    def _blur(self, ready: list[_Fit]) -> tuple[float | None, str]:
+        """The blur of projector and camera together, in projector pixels, and how it is known: from
+        several periods, else as calibrated, else (None) it is not.
 
         Blur of standard deviation s takes exp(-2π²s²f²) from a wave of frequency f, so the ratio of
         two waves' amplitudes tells s. The median over the scene is taken: scattering within the
         scene, which is global light, differs from place to place and stays in the amplitudes.
         """
         if len(ready) < 2 or len(ready) != len(self._periods):
-            return None
-        squares = self._squared_frequencies()
+            return self._known_blur, "" if self._known_blur is None else "calibration"
+        squares = np.asarray([-log(of_wave(1.0, p, self._weave)) for p in self._periods])
         logs = []
         first = None
         for fit in ready:
@@ -183,19 +201,13 @@ class LeastSquares:
             ratio = power[bright] / np.maximum(first[bright], np.float32(1e-12))
             logs.append(0.5 * float(np.log(np.maximum(np.median(ratio), 1e-6))))
         slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
-        return float(np.sqrt(max(-slope, 0.0) / (2.0 * np.pi**2)))
+        return float(np.sqrt(max(-slope, 0.0))), "scan"
 
-    def _squared_frequencies(self) -> NDArray[np.float64]:
-        """Mean square of each wave's spatial frequency; its weave makes it higher along the other
-        axis."""
-        squares: NDArray[np.float64] = 1.0 / np.square(np.asarray(self._periods))
-        return squares * (1.0 + 0.5 * self._weave**2)
-
-    def _gains(self, blur: float | None, count: int) -> list[float]:
+    def _gains(self, blur: float | None) -> list[float]:
         """What gives each wave its amplitude back."""
-        if not blur:
-            return [1.0] * count
-        return [float(g) for g in np.exp(2.0 * np.pi**2 * blur**2 * self._squared_frequencies())]
+        if not self._periods:
+            return [1.0] * len(self._fits)
+        return [1.0 / of_wave(blur or 0.0, period, self._weave) for period in self._periods]
 
     def _separate(
         self, fit: _Fit, noise: Noise | None, gain: float
@@ -203,30 +215,50 @@ class LeastSquares:
         """Direct, global and their variances from one frequency."""
         mean, cosine, sine = fit.solve()
         b = self._leakage
-        sigma = self._response.deviation(noise, self._response.counts(mean))
-        mean_var, wave_var = fit.variances()
         power = cosine * cosine + sine * sine
+        of_mean, of_wave = self._response.wave_deviations(noise, mean, np.sqrt(power))
+        mean_var, wave_var = fit.variances()
         if self._noise.measured:
             # |B| of noise alone is not 0: to first order its square is too large by one variance.
-            power = np.maximum(power - np.float32(wave_var) * sigma * sigma, 0)
+            power = np.maximum(power - np.float32(wave_var) * of_wave * of_wave, 0)
         amplitude: Plane = np.sqrt(power)
         direct: Plane = amplitude * np.float32(2.0 * gain / (1.0 - b))
         total = self._references.total(mean, b)
         indirect: Plane = total.light - direct
-        variance = sigma * sigma
-        direct_var: Plane = variance * np.float32(wave_var * (2.0 * gain / (1.0 - b)) ** 2)
-        of_total = np.asarray(mean_var * total.of_half + total.of_frame, dtype=np.float32)
-        total_var: Plane = variance * of_total
+        direct_var: Plane = np.square(of_wave) * np.float32(
+            wave_var * (2.0 * gain / (1.0 - b)) ** 2
+        )
+        total_var = total.of_references(
+            lambda light: self._response.deviation(noise, self._response.counts(light))
+        )
+        total_var += np.square(of_mean) * np.asarray(mean_var * total.of_half, dtype=np.float32)
         return direct, indirect, direct_var, direct_var + total_var
 
-    def _mirrored(self, fit: _Fit, noise: Noise | None) -> NDArray[np.bool_]:
-        """Where the phase runs against the picture's."""
+    def _mirrored(
+        self, fit: _Fit, noise: Noise | None
+    ) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
+        """Where the phase runs against the picture's, or changes faster: see `residue`."""
         _, cosine, sine = fit.solve()
         wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
         if wave.ndim == 3:
             wave = np.asarray(wave.sum(axis=2), dtype=np.complex64)
         deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
-        return reversed_pattern([wave], strength([wave], deviation))
+        even = bool(self._periods)
+        return mirrored([wave], strength([wave], deviation), turning=even, smooth=even)
+
+    def _ripple(self, ready: list[_Fit], noise: Noise | None) -> float | None:
+        """How much of the wave shows in its own mean and amplitude: see `ripple`."""
+        found = []
+        for fit in ready:
+            mean, cosine, sine = fit.solve()
+            wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
+            if wave.ndim == 3:
+                mean = np.asarray(mean.sum(axis=2), dtype=np.float32)
+                wave = np.asarray(wave.sum(axis=2), dtype=np.complex64)
+            deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
+            found.append(ripple(mean, wave, strength([wave], deviation) > np.float32(STRONG)))
+        known = [one for one in found if one is not None]
+        return max(known) if known else None
 
     def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
         mean, _, _ = fit.solve()
@@ -320,7 +352,9 @@ def _disagree(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> NDArray[np.boo
     return differ if differ.ndim == 2 else np.asarray(np.logical_or.reduce(differ, axis=2))
 
 
-def _advice(misfit: float | None, distortion: float | None, disagreeing: float) -> list[str]:
+def _advice(
+    misfit: float | None, distortion: float | None, disagreeing: float, rippled: float | None
+) -> list[str]:
     """What to do about frames that are no sinusoids in time; [] where they are."""
     lines = []
     if misfit is not None and (
@@ -330,6 +364,13 @@ def _advice(misfit: float | None, distortion: float | None, disagreeing: float) 
             f"the frames are {misfit:.0f} times further from a sinusoid than noise takes them: "
             "they are not the phases that were declared (--phases, --periods), the tone curve is "
             "not linear, or something moved"
+        )
+    elif rippled is not None and rippled > _RIPPLED:
+        lines.append(
+            f"the pattern itself shows in the components, by {rippled:.0%} of the wave: the "
+            "projector's or the camera's tone curve is not linear (run `umbra calibrate tone`, or "
+            "give the camera's curve with --tone), or the frames are not the phases that were "
+            "declared (--phases)"
         )
     if disagreeing > _MANY:
         lines.append(

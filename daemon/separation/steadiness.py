@@ -19,6 +19,9 @@ from daemon.separation.finish import bits
 from daemon.separation.radiometry import Plane
 from daemon.separation.references import References
 
+HALF = 0.02
+"""Lit fractions so near to a half are one."""
+
 _DEVIATIONS = 6.0
 _PART = 0.1  # of the light: less is a bend of a tone curve, or light that was not smooth
 _OFF = 0.02  # of the light, all over the picture
@@ -43,7 +46,7 @@ def compare(
     if black is None or white is None or clipped is None:
         return None, {}, []
     expected = (white + black) * np.float32(0.5)
-    good = ~clipped & (white - black > 0.1 * float(np.quantile(white - black, 0.99)))
+    good = _good(black, white, clipped)
     if not good.any():
         return None, {}, []
     ratio = float(np.median(half[good] / np.maximum(expected[good], np.float32(1e-6))))
@@ -58,7 +61,7 @@ def compare(
             "camera's curve with --tone, or let the lamp warm up"
         )
     else:  # a wrong tone curve makes any K/W
-        lines += _leaks(_calm(black)[good], _calm(white)[good], leakage)
+        lines += leaks(references, leakage)
     if abs(ratio - 1.0) >= _WHOLLY_OFF:
         return None, facts, lines
     limit = np.maximum(np.float32(_DEVIATIONS) * deviation, np.float32(_PART) * np.abs(expected))
@@ -69,14 +72,33 @@ def compare(
     return bits(np.asarray(opened) > 0, Quality.MOVED), facts, lines
 
 
+def _good(black: Plane, white: Plane, clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Samples that the source lights."""
+    return ~clipped & (white - black > 0.1 * float(np.quantile(white - black, 0.99)))
+
+
 def _calm(plane: Plane) -> Plane:
     """With less noise."""
     return np.asarray(cv2.blur(plane, (_CALM, _CALM)), dtype=np.float32).reshape(plane.shape)
 
 
-def _leaks(black: Plane, white: Plane, leakage: float) -> list[str]:
-    """What K/W says of the leakage b: with ambient light it is b or more, everywhere."""
+def leaks(references: References, leakage: float) -> list[str]:
+    """What K/W says of the leakage b: with ambient light it is b or more, everywhere. Lines of
+    advice; [] without black and white frames."""
+    dark, lit = references.mean(Lighting.BLACK), references.mean(Lighting.WHITE)
+    clipped = references.white_saturated
+    if dark is None or lit is None or clipped is None:
+        return []
+    good = _good(dark, lit, clipped)
+    if not good.any():
+        return []
+    black, white = _calm(dark)[good], _calm(lit)[good]
     low, middle, high = (float(q) for q in np.quantile(black / white, [0.25, 0.5, 0.75]))
+    if middle < -_OVER:
+        return [
+            f"black frames are below black, by {-middle:.3f} of the light of white ones: the black "
+            "level that was given is too high (--black, `umbra calibrate dark`)"
+        ]
     if leakage > middle + _OVER:
         return [
             f"the leakage {leakage:g} cannot be: black frames have {middle:.3f} of the light of "

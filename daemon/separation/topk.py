@@ -17,22 +17,19 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
-from daemon.separation.handedness import WaveSums, imbalance, reversed_pattern, strength
+from daemon.separation.handedness import WaveSums
 from daemon.separation.noise import Noise
 from daemon.separation.order import Ranked
 from daemon.separation.order_model import BLURS, RATIOS, OrderErrors, fit, simulate
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
+from daemon.separation.residue import NOT_SHIFTS, of_shifts
 from daemon.separation.scan_noise import ScanNoise
-from daemon.separation.steadiness import compare
+from daemon.separation.steadiness import HALF, compare
 
 KEEP = 5
 """Samples kept at each end; a checkerboard's 25 shifts light every pixel wholly in 9 or more."""
 
-_UNLIKE = 0.1
-"""Imbalance of a checkerboard's waves from which the frames are not its shifts."""
-
-_HALF = 0.02  # lit fractions so near to a half are one
 _GROUPS = 8
 _FINE = 64  # steps between tabulated ratios
 _TINY = np.float32(1e-6)
@@ -135,7 +132,7 @@ class TopK:
         moved: NDArray[np.uint16] | None = None
         steady: dict[str, Any] = {}
         advice: list[str] = []
-        if abs(self._alpha - 0.5) < _HALF:
+        if abs(self._alpha - 0.5) < HALF:
             middle = (lit + unlit) * np.float32(0.5)
             moved, steady, advice = compare(self._references, middle, deviation, b, ranked=True)
         ambient, source = self._references.ambient(lit, unlit, self._alpha, b)
@@ -166,7 +163,8 @@ class TopK:
         saturated = self._saturated
         if saturated is None:
             saturated = self._high.planes[0] >= self._response.saturated_from
-        mirrored, told, wrong = self._mirrored(deviation)
+        # ranks hold counts, averages light: near enough for a limit
+        mirrored, told, as_declared = of_shifts(self._waves, deviation)
         flags = np.zeros(direct.shape[:2], dtype=np.uint16) if moved is None else moved
         if mirrored is not None:
             flags |= bits(mirrored, Quality.RESIDUE)
@@ -197,34 +195,9 @@ class TopK:
                 "noise_from": "repeated frames" if self._noise.measured else "ranks",
                 **told,
                 **steady,
-                "advice": wrong + advice,
+                "advice": ([] if as_declared else [NOT_SHIFTS]) + advice,
                 **self._references.facts(source),
             },
-        )
-
-    def _mirrored(
-        self, deviation: Plane
-    ) -> tuple[NDArray[np.bool_] | None, dict[str, Any], list[str]]:
-        """Where the pattern lies the wrong way round (None where the scan cannot tell), and whether
-        it is the pattern that was declared: facts and advice."""
-        waves = None if self._waves is None else self._waves.waves()
-        if self._waves is None or waves is None:
-            return None, {"mirrors_looked_for": False}, []
-        # ranks hold counts, averages light: near enough for a limit
-        strong = strength(waves, deviation * self._waves.gain)
-        unlike = imbalance(waves, strong)
-        if unlike is None or unlike <= _UNLIKE:
-            misfit = None if unlike is None else round(unlike, 4)
-            facts = {"mirrors_looked_for": True, "pattern_misfit": misfit}
-            return reversed_pattern(waves, strong), facts, []
-        return (
-            None,
-            {"mirrors_looked_for": False, "pattern_misfit": round(unlike, 4)},
-            [
-                "the frames are not the shifts of a checkerboard that were declared, in their "
-                "order (--checker, --shift, --shifts), or something moved: see that the folder "
-                "holds this scan alone, and that its names sort in the order of the shifts"
-            ],
         )
 
     def _light(self, samples: NDArray[Any]) -> Plane:
@@ -252,7 +225,7 @@ class TopK:
         if self._noise.measured:
             return blur, None
         sigma = ratios * steps / np.interp(np.log(ratios), np.log(RATIOS), models[blur].step)
-        slope = self._response.deviation(None, self._response.counts(light)) * 12.0**0.5
+        slope = self._response.slope(self._response.counts(light))
         levels = self._response.counts(light).astype(np.float64)
         return blur, Noise(
             tuple(levels.tolist()),

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 
 from daemon import patterns
 from daemon.separation.estimator import Lighting, Measurement, NotYet, Observation
+from daemon.separation.finish import SIGNIFICANT
 from daemon.separation.graycode import Coded, GrayCodeDecoder
 from daemon.separation.radiometry import FrameMean, Plane, Response
-from daemon.separation.sampling import Turns
+from daemon.separation.sampling import Moments, Turns
 from protocol.patterns import AnyPattern
 
 REACH = 8
@@ -113,6 +114,7 @@ class Verification:
         self._response = replace(response, bayer="")
         self._decoder = GrayCodeDecoder(self._response, images=images, leakage=0.0)
         self._references = {kind: FrameMean(self._response) for kind in Lighting}
+        self._white = Moments()  # its repeats tell noise, which a window's picture cannot
         self._mean = FrameMean(self._response)
         self._turns = Turns()
         self._shape: tuple[int, ...] = ()  # of a frame
@@ -141,6 +143,7 @@ class Verification:
         if observation.lighting is not Lighting.PATTERN:
             self._references[observation.lighting].add(windows)
             if observation.lighting is Lighting.WHITE:
+                self._white.add(self._response.linear(windows))
                 for k in range(len(self._spots)):
                     middle = _cut(windows, k)[REACH - 1 : REACH + 2, REACH - 1 : REACH + 2]
                     self._saturated[k] |= bool((middle >= self._response.saturated_from).any())
@@ -162,9 +165,11 @@ class Verification:
         return cut[..., 1] if cut.ndim == 3 else cut  # the paper measures in the green channel
 
     def _locate(self) -> None:
-        planes = self._decoder.result().planes
         places = []
+        variance = self._white.variance()
         for k, spot in enumerate(self._spots):
+            noise = np.sqrt(_cut(variance, k).mean(), dtype=np.float32)
+            planes = self._decoder.coordinates(np.full_like(variance, SIGNIFICANT * noise))
             green = _green(self._bayer, spot, self._shape)
             column, row = _cut(planes["column"], k), _cut(planes["row"], k)
             reach_px = _NEAR_BLURRED_PX if self._source.blur_px else _NEAR_PX
@@ -324,4 +329,6 @@ def _plane(coordinates: Plane) -> Plane:
         solved, *_ = np.linalg.lstsq(design, coordinates[use].astype(np.float64), rcond=None)
         fitted = solved[0] + solved[1] * x + solved[2] * y
         use &= np.abs(coordinates - fitted) <= _OUTLIER_PX
+    if not np.ptp(coordinates[use]):  # one coarse cell: its middle may be far from the point
+        raise NotYet("the code's fine stripes cannot be read there")
     return fitted.astype(np.float32)

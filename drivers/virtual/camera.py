@@ -31,6 +31,7 @@ from drivers.clock import NS
 from drivers.virtual.device import VirtualDevice, VirtualOptions
 from drivers.virtual.faults import Fault
 from drivers.virtual.geometry import F32
+from drivers.virtual.sky import Sway
 from drivers.virtual.timeline import Forgotten
 from drivers.virtual.transport import mosaic, pick, room
 from drivers.virtual.view import view
@@ -68,6 +69,8 @@ class CameraOptions(VirtualOptions, frozen=True, kw_only=True, forbid_unknown_fi
     noise: bool = True  # shot and read noise; rounding stays
     ambient: Annotated[float, Meta(ge=0)] = 0.02  # radiance of white under the room's light
     shake_px: Annotated[float, Meta(ge=0)] = 0.0  # sd of the picture's place, frame by frame
+    gusts: tuple[tuple[float, Annotated[float, Meta(ge=0)]], ...] = ()  # (second, sd in px)
+    sway_hz: Annotated[float, Meta(gt=0)] = 1.5  # how fast a gust makes the camera sway
     seed: Annotated[int, Meta(ge=0)] = 1
 
 
@@ -116,6 +119,8 @@ class VirtualCamera(VirtualDevice, Camera):
         self._next = 0  # sequence number
         self._frames = 0  # since the camera was made: seeds the noise
         self._last: tuple[NDArray[Any], Frame] | None = None
+        self._epoch = self.clock.now_ns()
+        self._sway = Sway(options.gusts, options.sway_hz, options.seed)
 
     # ------------------------------------------------------------ settings
 
@@ -169,6 +174,8 @@ class VirtualCamera(VirtualDevice, Camera):
             self._format,
             black_level=self._black,
             exposure_range_us=EXPOSURE_US,
+            gain_range=GAIN_DB,
+            gain_unit="dB",
             max_rate_hz=NS / fastest,
             readout_s=self._o.readout_ms / 1e3,
             rolling_s=self._o.rolling_ms / 1e3 if self._o.rolling_told else 0.0,
@@ -430,6 +437,9 @@ class VirtualCamera(VirtualDevice, Camera):
     def _light(self, start_ns: int, end_ns: int, rng: np.random.Generator) -> list[F32]:
         """Mean radiance, one plane a layout. Raises Forgotten."""
         dx, dy = rng.normal(0, self._o.shake_px, 2) if self._o.shake_px else (0.0, 0.0)
+        if self._o.gusts:
+            sway = self._sway.at(((start_ns + end_ns) / 2 - self._epoch) / NS)
+            dx, dy = dx + sway[0], dy + sway[1]
         still = not (dx or dy)
         layouts = self._layouts() if still else ("R", "G", "B")
         planes = self._radiance(start_ns, end_ns, layouts)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import typer
 
 from protocol.cli.delivery import write_file
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.options import build, options_of, with_options
-from protocol.cli.output import print_facts, print_json
+from protocol.cli.output import print_facts, print_json, say
 from protocol.cli.preview import png_name, say_facts
 from protocol.errors import Code, UmbraError
 from protocol.messages import Camera, CameraSettings, Done, Picture
+
+if TYPE_CHECKING:
+    from protocol.client import Client
 
 
 class Switch(enum.StrEnum):
@@ -59,31 +63,63 @@ def snap(
 # ---------------------------------------------------------------- camera, lights
 
 
-def _camera(rig: Rig = None, keys: Keys = None, as_json: Json = False, **given: Any) -> None:
+def _camera(
+    *,
+    auto_exposure: Annotated[
+        bool,
+        typer.Option(
+            "--auto-exposure",
+            help="Choose the exposure for the scene as it is lit now; one that is given is the "
+            "longest.",
+        ),
+    ] = False,
+    rig: Rig = None,
+    keys: Keys = None,
+    as_json: Json = False,
+    **given: Any,
+) -> None:
     """Read the camera's settings, or change those that are given.
+
+    --auto-exposure takes a few pictures: show white or switch the lights on first (umbra show
+    white). Under a projector the exposure is a whole number of its periods.
 
     --json: a Camera.
     """
     wanted = build(CameraSettings, given)
+    facts: dict[str, Any] = {}
     with connect(rig, keys) as client:
-        settings = client.camera(
-            exposure_us=wanted.exposure_us,
-            gain=wanted.gain,
-            pixel_format=wanted.pixel_format,
-            frame_rate_hz=wanted.frame_rate_hz,
-            roi=wanted.roi,
-        )
+        if auto_exposure:
+            longest_us = wanted.exposure_us
+            wanted = msgspec.structs.replace(wanted, exposure_us=None)
+            if wanted != CameraSettings():
+                _set(client, wanted)
+            facts = client.auto_exposure(longest_us)
+            wanted = CameraSettings()
+        settings = _set(client, wanted)
     if as_json:
-        print_json(Camera(settings=settings))
+        print_json(Camera(settings=settings, facts=facts))
         return
-    print_facts(
-        [
-            ("exposure", "" if settings.exposure_us is None else f"{settings.exposure_us:g} µs"),
-            ("gain", "" if settings.gain is None else f"{settings.gain:g}"),
-            ("pixel format", settings.pixel_format or ""),
-            ("rate", "" if settings.frame_rate_hz is None else f"{settings.frame_rate_hz:g} Hz"),
-            ("roi", "" if settings.roi is None else ",".join(map(str, settings.roi))),
-        ]
+    lines = [
+        ("exposure", "" if settings.exposure_us is None else f"{settings.exposure_us:g} µs"),
+        ("gain", "" if settings.gain is None else f"{settings.gain:g}"),
+        ("pixel format", settings.pixel_format or ""),
+        ("rate", "" if settings.frame_rate_hz is None else f"{settings.frame_rate_hz:g} Hz"),
+        ("roi", "" if settings.roi is None else ",".join(map(str, settings.roi))),
+    ]
+    if facts:
+        lines.insert(1, ("brightest", f"{facts['brightest']:.1%} of full scale"))
+    print_facts(lines)
+    if "problem" in facts:
+        say(f"umbra: {facts['problem']}")
+
+
+def _set(client: Client, wanted: CameraSettings) -> CameraSettings:
+    return client.camera(
+        exposure_us=wanted.exposure_us,
+        gain=wanted.gain,
+        pixel_format=wanted.pixel_format,
+        frame_rate_hz=wanted.frame_rate_hz,
+        roi=wanted.roi,
     )
 
 

@@ -19,7 +19,7 @@ from protocol.cli.delivery import write_file
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.output import on_terminal, print_json, say
 from protocol.errors import Code, UmbraError
-from protocol.messages import Picture, PreviewTaken
+from protocol.messages import Picture, PreviewTaken, RigState
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from protocol.client import Client
     from protocol.results import Picture as Seen
 
+OLD_S = 3.0  # a picture's age that is worth a word
 LEASE_S = 10.0
 """A live view that nobody renews ends after this."""
 _DRAWING = "\x1b[?1049h\x1b[?25l"  # a screen of its own, without a cursor
@@ -52,7 +53,7 @@ def preview(
     *,
     what: Annotated[
         What | None,
-        typer.Argument(help="The latest frame (default), or the separation so far."),
+        typer.Argument(help="A frame (default), or the separation so far."),
     ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="One picture after the other, until Ctrl-C.")
@@ -84,7 +85,9 @@ def preview(
     keys: Keys = None,
     as_json: Json = False,
 ) -> None:
-    """The latest frame, small: drawn in the terminal, or written with -o.
+    """A frame, small: drawn in the terminal, or written with -o.
+
+    While a run has the camera it is the run's latest; otherwise one is taken.
 
     --live takes frames by hand, and follows those of a run while one goes on. What saturates is
     magenta; below the picture are exposure, brightness and a histogram.
@@ -107,6 +110,8 @@ def preview(
     with connect(rig, keys) as client:
         if not live:
             chosen = what or What.FRAME
+            if chosen is What.FRAME:
+                _take_one(client)
             _one(
                 client.preview(width, chosen.value), out, columns, lines, mark=mark, as_json=as_json
             )
@@ -126,6 +131,16 @@ def preview(
                     _write(out, pixels, number, numbered=numbered)
                 elif screen is not None:
                     screen.draw(pixels, seen.facts)
+
+
+def _take_one(client: Client) -> None:
+    """A frame of now, where nobody else has the camera; else the latest, whose age is told."""
+    if client.status().state not in {RigState.IDLE, RigState.MANUAL}:
+        return
+    try:
+        client.snap()
+    except UmbraError as error:
+        say(f"umbra: no new frame: {error}")
 
 
 def _one(
@@ -309,6 +324,8 @@ def told_of(facts: dict[str, Any]) -> str:
         told.append(f"mean {facts['mean']:.0f} of {facts['full_scale']:.0f}")
     if "saturated" in facts:
         told.append(f"{100 * facts['saturated']:.2f} % saturated")
+    if facts.get("age_s", 0.0) >= OLD_S:
+        told.append(f"taken {facts['age_s']:.0f} s ago")
     return " · ".join(told)
 
 

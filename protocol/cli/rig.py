@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,15 +18,27 @@ from protocol.cli.output import (
     say,
     seconds,
     size,
+    when,
 )
 from protocol.cli.words import frames, method
 from protocol.errors import Code, UmbraError
-from protocol.messages import DeviceInfo, Devices, Discovered, Done, Log, Search, Status
+from protocol.following import SILENCE_S
+from protocol.messages import (
+    DeviceInfo,
+    Devices,
+    Discovered,
+    Done,
+    Log,
+    Logged,
+    RunState,
+    Search,
+    Status,
+)
 
 if TYPE_CHECKING:
     from protocol.client import Client
 
-_FOLLOW_S = 1.0
+_CATCH_UP = 500  # records that are told from those that were shown
 
 
 def status(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
@@ -59,6 +70,12 @@ def _status_lines(now: Status, server: str) -> list[tuple[str, str]]:
             if now.progress.remaining_s is not None:
                 told += f", {seconds(now.progress.remaining_s)} left"
         lines.append(("run", told))
+        waits = now.progress.waits if now.progress is not None else None
+        if waits is not None:
+            since = f"since {when(waits.since)}, until {when(waits.until)}"
+            lines.append(("waits for", f"{waits.what}: {waits.seen} ({since})"))
+        elif now.progress is not None and now.run.state is RunState.PAUSED:
+            lines.append(("why", now.progress.phase))
     lines.append(("queue", f"{len(now.queue)} waiting" if now.queue else "empty"))
     if now.lock is not None:
         note = f" ({now.lock.note})" if now.lock.note else ""
@@ -176,7 +193,8 @@ def log(
 ) -> None:
     """The last log records of a run, the oldest first; without RUN or with --daemon, the daemon's.
 
-    The daemon keeps the last 5000 since its start; its journal (journalctl -u umbrad) has them all.
+    A run's are kept in its folder (log.jsonl, up to 1 MiB). Of its own the daemon keeps the last
+    5000 since its start; its journal (journalctl -u umbrad) has them all.
 
     --json: a Log; with --follow a record a line.
     """
@@ -201,16 +219,23 @@ def log(
 
 
 def _followed(client: Client, run: str, limit: int) -> Iterator[dict[str, Any]]:
-    """The last records, then those that come: asked for each second, told from the old by all that
-    they say, their time included."""
-    last: dict[str, Any] | None = None
-    while True:
-        records = client.log(run, limit)
-        places = [i for i, record in enumerate(records) if record == last]
-        yield from records[places[-1] + 1 if places else 0 :]
-        if records:
-            last, limit = records[-1], max(limit, 200)
-        time.sleep(_FOLLOW_S)
+    """The last records, then those that come. Subscribed to before it is asked, so that none is
+    between; what both have is left out. After a gap or a long silence what was missed is asked for.
+    """
+    with client.subscribe(Logged.topic) as events:
+        shown = list(client.log(run, limit))
+        yield from shown
+        while True:
+            notice = events.next(SILENCE_S)
+            new: Sequence[dict[str, Any]]
+            if notice is not None and not notice.gap and isinstance(notice.body, Logged):
+                new = [notice.body.record]
+            else:
+                new = client.log(run, _CATCH_UP)
+            for one in new:
+                if one not in shown and (not run or one.get("run") == run):
+                    shown = [*shown[-_CATCH_UP:], one]
+                    yield one
 
 
 def log_line(record: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +22,7 @@ from protocol.cli.watch import follow, must_be_done, tell
 from protocol.cli.words import Fetched, frames
 from protocol.errors import Code, UmbraError
 from protocol.messages import Health, RunInfo
-from protocol.scans import AnySeparation, Reference
+from protocol.scans import AnySeparation, PatternScan, Reference
 
 if TYPE_CHECKING:
     from protocol.client import Client
@@ -29,8 +30,11 @@ if TYPE_CHECKING:
 LIVE = {
     *("exposure_us", "gain", "references", "lights", "frame_rate_hz", "feed_mm_s"),
     *("coverage", "time_limit_s", "sweeps", "sweep_mm", "radius_mm", "centre_mm"),
+    *("auto_exposure", "deadline_s", "light_min", "light_max", "steady", "look_s"),
 }
 """Fields that are no options here: the photographs have them, or the files given say them."""
+TYPED = {"path": "DIR", "match": "--match", "bayer": "--bayer"}
+"""What is typed for the keys of the recording's driver."""
 OPTIONS = union_options(METHODS, without=LIVE)
 
 
@@ -44,7 +48,8 @@ class Bayer(enum.StrEnum):
 
 
 def _frame(what: str) -> Any:
-    return typer.Option(metavar="FILE", help=f"A photograph of the scene {what}.")
+    text = f"A photograph of the scene {what}; of a bracket once for each exposure."
+    return typer.Option(metavar="FILE", help=text)
 
 
 def _separate(
@@ -58,10 +63,12 @@ def _separate(
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="OUT", help="Folder for the products.")
     ],
-    black_frame: Annotated[Path | None, _frame("with the projector showing black")] = None,
-    white_frame: Annotated[Path | None, _frame("with the projector showing white")] = None,
-    ambient_frame: Annotated[Path | None, _frame("with the source off")] = None,
-    open_frame: Annotated[Path | None, _frame("with no occluder before the source (mesh)")] = None,
+    black_frame: Annotated[list[Path] | None, _frame("with the projector showing black")] = None,
+    white_frame: Annotated[list[Path] | None, _frame("with the projector showing white")] = None,
+    ambient_frame: Annotated[list[Path] | None, _frame("with the source off")] = None,
+    open_frame: Annotated[
+        list[Path] | None, _frame("with no occluder before the source (mesh)")
+    ] = None,
     bayer: Annotated[
         Bayer | None, typer.Option(help="The images are a raw colour mosaic that begins so.")
     ] = None,
@@ -74,6 +81,8 @@ def _separate(
 ) -> None:
     """Separate photographs or a video that you already have into direct and global light.
 
+    With --bracket, DIR holds each pattern's images one after the other, in the bracket's order.
+
     OUT gets direct.tiff and global.tiff (float32, linear, RGB), quality, preview and report: all
     of them, or nothing if anything is wrong.
 
@@ -85,18 +94,21 @@ def _separate(
         Reference.AMBIENT: ambient_frame,
         Reference.OPEN: open_frame,
     }
-    first = {kind: file.absolute() for kind, file in shots.items() if file is not None}
+    first = {kind: [file.absolute() for file in files] for kind, files in shots.items() if files}
     spec = spec_of(method, given, references=list(first))
+    bracket = spec.bracket if isinstance(spec, PatternScan) else None
+    _each_exposure(first, bracket or (1.0,))
+    ahead = [file for files in first.values() for file in files]
     delivery = Delivery(out, force=force)
     delivery.check()
-    for file in (source, *first.values()):
+    for file in (source, *ahead):
         if not file.exists():
             raise UmbraError(Code.BAD_INPUT, f"{file} does not exist")
     config = {
         "camera": {
             "driver": "replay",
             "path": str(source.absolute()),
-            "first": [str(file) for file in first.values()],
+            "first": [str(file) for file in ahead],
             "match": match,
             "bayer": bayer.value if bayer else None,
         },
@@ -117,11 +129,31 @@ def _separate(
     report(run.info, files, facts, as_json)
 
 
+def _each_exposure(first: Mapping[Reference, list[Path]], exposures: tuple[float, ...]) -> None:
+    """Raise UmbraError(bad_input) unless each kind of photograph is there at each exposure."""
+    for kind, files in first.items():
+        if len(files) != len(exposures):
+            each = ", ".join(f"{exposure:g}" for exposure in exposures)
+            wanted = (
+                f"the {len(exposures)} exposures of the bracket ({each}) take --{kind}-frame "
+                f"{len(exposures)} times, in that order"
+                if len(exposures) > 1
+                else f"--{kind}-frame is given once, unless exposures are bracketed (--bracket)"
+            )
+            raise UmbraError(Code.BAD_REQUEST, f"{wanted}: {len(files)} files were given")
+
+
+def as_typed(message: str) -> str:
+    """A message of the recording's driver with its keys as they were given: options, or DIR."""
+    return re.sub(r"`(\w+)`", lambda key: TYPED.get(key[1], key[0]), message)
+
+
 def usable(client: Client) -> None:
     """Raise UmbraError(bad_input) with the camera's own words if it cannot read its recording."""
     for device in client.devices():
         if device.health is not Health.READY:
-            raise UmbraError(Code.BAD_INPUT, device.message.removeprefix("camera: connect: "))
+            said = device.message.removeprefix("camera: connect: ")
+            raise UmbraError(Code.BAD_INPUT, as_typed(said))
 
 
 def report(info: RunInfo, files: Iterable[Path], facts: Mapping[str, Any], as_json: bool) -> None:

@@ -26,6 +26,9 @@ Feed = Annotated[
     typer.Option("--feed", metavar="MM_S", min=0.001, help="Default: half of the fastest."),
 ]
 
+_SIGNED = {"ignore_unknown_options": True}
+"""-10 is a place, not an option: after Grbl's homing every coordinate is negative."""
+
 app = typer.Typer(rich_markup_mode=None, add_completion=False, invoke_without_command=True)
 
 
@@ -60,7 +63,7 @@ def home(
     _act(rig, keys, as_json=as_json, wait=wait, act=lambda client: client.stage_home(timeout_s))
 
 
-@app.command()
+@app.command(context_settings=_SIGNED)
 def move(
     x: Annotated[float, typer.Argument(metavar="X", help="mm.")],
     y: Annotated[float, typer.Argument(metavar="Y", help="mm.")],
@@ -80,7 +83,7 @@ def move(
     )
 
 
-@app.command()
+@app.command(context_settings=_SIGNED)
 def circle(
     x: Annotated[float, typer.Argument(metavar="X", help="Of the centre, mm.")],
     y: Annotated[float, typer.Argument(metavar="Y")],

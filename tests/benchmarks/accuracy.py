@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from daemon.scans import catalog
 from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting
+from drivers.base import PixelFormat
 from protocol.scans import (
     AnyScan,
     Checkerboard,
@@ -125,38 +126,69 @@ class Beside:
     """RMSE of direct and global, ours and a peer's from the same frames, of full scale."""
 
     name: str
-    blur: float
+    blur: float  # px, that the rig does not know of
     ours: tuple[float, float]
     peer: tuple[float, float]
 
 
+COLOURS = (0.6, 1.0, 0.45)  # of the grey scene in a camera's red, green and blue
+
+
 def beside_peers() -> Iterator[Beside]:
-    """Sinusoids of N phases at each leakage, blur and noise; nothing where there is no peer."""
+    """Sinusoids of N phases at each leakage, blur and noise, on a mosaic, and with a blur that the
+    rig's calibration knows; nothing where there is no peer."""
     if peers.missing():
         return
-    for leakage, blur in ((0.0, 0.0), (LEAKAGE, BLUR), (LEAKAGE, 1.0)):
+    for leakage, blur, also in (
+        (0.0, 0.0, ""),
+        (LEAKAGE, BLUR, ""),
+        (LEAKAGE, BLUR, "Bayer"),
+        (LEAKAGE, 1.0, ""),
+        (LEAKAGE, 1.0, "calibrated"),
+    ):
         for sigma in SIGMAS:
             for count in (3, 8, 25):
-                light = Radiometry(leakage=leakage)
-                spec = Sinusoid(phases=count, weave=0.0, radiometry=light)
                 scene = Scene(sigma=sigma, leakage=leakage, blur=blur, ambient=0.05)
-                found = scene.scan(spec)
-                method = catalog.method_for(spec, scene.bench())
-                rng = np.random.default_rng(1)  # the scan's own noise
-                frames = []
-                for index in range(method.planned() or 0):
-                    step = method.step(index, {})
-                    assert isinstance(step, Expose)
-                    frames.append((step.lighting, scene.frame(step, rng)))
-                black = next(f for lighting, f in frames if lighting is Lighting.BLACK)
-                shown = [f for lighting, f in frames if lighting is Lighting.PATTERN]
-                direct, indirect = peers.fringes(shown, black, spec.periods[0])
-                yield Beside(
-                    f"b {leakage:g}, blur {blur:g} px, σ {sigma:g}, N = {count}",
-                    blur,
-                    (_rmse(found.direct, scene.direct), _rmse(found.global_, scene.indirect)),
-                    (_rmse(direct, scene.direct), _rmse(indirect, scene.indirect)),
-                )
+                if also == "Bayer":
+                    scene.pixel_format = PixelFormat.BAYER_RG16
+                    scene.change = _through_filters
+                if also == "calibrated":
+                    scene.calibration = {"optics_blur_px": blur}
+                name = f"b {leakage:g}, blur {blur:g} px, σ {sigma:g}, N = {count}"
+                yield _beside(scene, count, f"{also}, {name}" if also else name)
+
+
+def _through_filters(light: NDArray[Any], _: Expose) -> NDArray[Any]:
+    red, green, blue = COLOURS
+    tile = np.asarray([[red, green], [green, blue]])
+    seen: NDArray[Any] = light * np.tile(tile, (light.shape[0] // 2, light.shape[1] // 2))
+    return seen
+
+
+def _beside(scene: Scene, count: int, name: str) -> Beside:
+    spec = Sinusoid(phases=count, weave=0.0, radiometry=Radiometry(leakage=scene.leakage))
+    found = scene.scan(spec)
+    method = catalog.method_for(spec, scene.bench())
+    rng = np.random.default_rng(1)  # the scan's own noise
+    frames = []
+    for index in range(method.planned() or 0):
+        step = method.step(index, {})
+        assert isinstance(step, Expose)
+        frames.append((step.lighting, scene.frame(step, rng)))
+    black = next(f for lighting, f in frames if lighting is Lighting.BLACK)
+    shown = [f for lighting, f in frames if lighting is Lighting.PATTERN]
+    truth: list[NDArray[Any]] = [scene.direct, scene.indirect]
+    if scene.pixel_format.bayer:
+        truth = [plane[..., None] * np.asarray(COLOURS) for plane in truth]
+        theirs = peers.fringes_of_mosaics(shown, black, spec.periods[0])
+    else:
+        theirs = peers.fringes(shown, black, spec.periods[0])
+    return Beside(
+        name,
+        0.0 if scene.calibration else scene.blur,
+        (_rmse(found.direct, truth[0]), _rmse(found.global_, truth[1])),
+        (_rmse(theirs[0], truth[0]), _rmse(theirs[1], truth[1])),
+    )
 
 
 def _rmse(plane: NDArray[Any], truth: NDArray[Any]) -> float:

@@ -13,6 +13,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,3 +44,15 @@ def fringes(
         np.asarray(direct, dtype=np.float64).reshape(height, width),
         np.asarray(indirect, dtype=np.float64).reshape(height, width),
     )
+
+
+def fringes_of_mosaics(
+    frames: Sequence[NDArray[Any]], black: NDArray[Any], period: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The same (H, W, 3) RGB from RGGB mosaics: it has no mosaics, so that frames are made colour
+    pictures first, as one would with OpenCV, and each colour is decoded."""
+    shown = [cv2.cvtColor(frame, cv2.COLOR_BayerRGGB2RGB) for frame in frames]
+    dark = cv2.cvtColor(black, cv2.COLOR_BayerRGGB2RGB)
+    colours = [fringes([f[..., c] for f in shown], dark[..., c], period) for c in range(3)]
+    direct, indirect = zip(*colours, strict=True)
+    return np.stack(direct, axis=-1), np.stack(indirect, axis=-1)

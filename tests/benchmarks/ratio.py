@@ -13,6 +13,10 @@ from collections.abc import Callable, Sequence
 import msgspec
 
 
+class Skipped(Exception):
+    """A benchmark cannot run here; says what it lacks."""
+
+
 class Ratio(msgspec.Struct, frozen=True, kw_only=True):
     """One line of the table, and of bench.json.
 

@@ -23,6 +23,7 @@ from protocol.patterns import BLACK
 from protocol.scans import AnyScan
 
 FULL = 65535
+OWN_US = 10_000.0
 
 
 @dataclass
@@ -38,6 +39,7 @@ class Scene:
     reach: float = 40.0  # of global light, px
     gamma: float = 1.0  # of the projector
     pixel_format: PixelFormat = PixelFormat.MONO16
+    calibration: dict[str, Any] = field(default_factory=dict)  # of the rig
     change: Callable[[NDArray[Any], Expose], NDArray[Any]] = field(default=lambda light, _: light)
 
     def __post_init__(self) -> None:
@@ -68,7 +70,8 @@ class Scene:
             around = cv2.blur(emitted, (65, 65), borderType=cv2.BORDER_REFLECT)
             around = cv2.GaussianBlur(around, (0, 0), self.reach, borderType=cv2.BORDER_REFLECT)
             light = light + emitted * self.direct + around * self.indirect
-        light = self.change(light, step) + rng.normal(0, 1, light.shape) * self.sigma * FULL
+        light = self.change(light, step) * ((step.exposure_us or OWN_US) / OWN_US)
+        light = light + rng.normal(0, 1, light.shape) * self.sigma * FULL
         counts = np.asarray(np.rint(np.clip(light, 0, FULL)), dtype=np.uint16)
         # a colour camera sees the same grey scene in each of its channels
         channels = self.pixel_format.channels
@@ -79,6 +82,8 @@ class Scene:
         return Bench(
             CameraInfo(self.width, self.height, self.pixel_format),
             ProjectorInfo(self.width, self.height, refresh_hz=60),
+            calibration=self.calibration,
+            exposure_us=OWN_US,
         )
 
     def scan(self, spec: AnyScan, seed: int = 1) -> Components:

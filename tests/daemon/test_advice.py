@@ -23,12 +23,20 @@ PROJECTOR = ProjectorInfo(width=192, height=144, refresh_hz=60)
 BLACK = 64.0
 
 
-def bench(leakage: float = 0.0, exposure_us: float = 16_666.7) -> Bench:
+def bench(gain: float | None = None, known: dict[str, float] | None = None) -> Bench:
     return Bench(
-        CameraInfo(192, 144, PixelFormat.MONO12, black_level=BLACK),
+        CameraInfo(
+            192,
+            144,
+            PixelFormat.MONO12,
+            black_level=BLACK,
+            gain_range=None if gain is None else (0.0, 24.0),
+            gain_unit="dB",
+        ),
         PROJECTOR,
-        exposure_us=exposure_us,
-        calibration={"leakage": leakage, "tone": list(range(256))},
+        exposure_us=16_666.7,
+        gain=gain,
+        calibration={"leakage": 0.0, "tone": list(range(256)), **(known or {})},
     )
 
 
@@ -39,10 +47,12 @@ def advised(
     scatter_px: float = 0.0,
     level: float = 3000.0,
     error: float = 0.01,
+    gain: float | None = None,
+    known: dict[str, float] | None = None,
 ) -> Measurement:
     """The method on a flat scene with these faults, seen pixel for pixel."""
     rng = np.random.default_rng(5)
-    method = catalog.method_for(Advise(error=error), bench())
+    method = catalog.method_for(Advise(error=error), bench(gain, known))
     estimator = method.estimator()
     index = 0
     while (step := method.step(index, estimator.summary())) is not None:
@@ -100,7 +110,7 @@ def test_local_scattering_is_named_and_keeps_checkers_small() -> None:
 
 def test_a_dim_scene_is_exposed_longer_and_a_saturated_one_refused() -> None:
     dim = advised(level=700.0).facts
-    assert dim["exposure_factor"] > 3
+    assert dim["level_factor"] > 3
     assert dim["exposure_us"] % (1e6 / 60) == pytest.approx(0, abs=1)
     with pytest.raises(NotYet, match="expose more briefly"):
         advised(level=6000.0)
@@ -137,3 +147,18 @@ def test_any_size_is_covered_by_the_shifts_that_are_advised(size: int) -> None:
     shifts = -(-size // step) + 2
     command = f"umbra scan checkerboard --checker {size} --shift {step} --shifts {shifts}"
     assert catalog.method_for(parsed(command), bench()).planned()
+
+
+def test_a_second_period_where_blur_is_not_known() -> None:
+    assert len(advised(blur=0.9).facts["periods_px"]) == 2
+    assert len(advised(blur=0.1).facts["periods_px"]) == 1
+    known = advised(blur=0.9, known={"optics_blur_px": 0.9}).facts
+    assert len(known["periods_px"]) == 1
+
+
+def test_a_gain_is_traded_for_exposure() -> None:
+    facts = advised(level=700.0, gain=12.0).facts
+    assert facts["gain"] == 0.0
+    assert facts["level_factor"] > 3
+    assert "--gain 0" in facts["commands"][0]
+    assert advised(level=3000.0).facts["gain"] is None  # of a camera without one

@@ -14,7 +14,14 @@ from daemon.calibration import Calibrations
 from daemon.separation.estimator import Measurement
 from daemon.store import RunFolder, Store
 from protocol.messages import RunState
-from protocol.scans import AnyScan, CalibrateDark, CalibrateLeak, CalibrateTone
+from protocol.scans import (
+    AnyScan,
+    CalibrateDark,
+    CalibrateLatency,
+    CalibrateLeak,
+    CalibrateTone,
+    Checkerboard,
+)
 
 RIG: dict[str, Any] = {
     "camera": {"driver": "virtual", "model": "C", "serial": "1"},
@@ -100,3 +107,20 @@ def test_a_run_that_failed_or_was_damaged_calibrates_nothing(store: Store) -> No
     found = Calibrations(store, 30).of(RIG, SETTINGS)
     assert found["values"] == {}
     assert [one["why"] for one in found["ignored"]] == ["it cannot be read"]
+
+
+def test_until_a_latency_is_measured_what_the_projector_assumes_is_waited_for(
+    store: Store,
+) -> None:
+    rig = {**RIG, "projector": {**RIG["projector"], "facts": {"assumed_latency_s": 0.1}}}
+    calibrations = Calibrations(store, 30)
+    found = calibrations.of(rig, SETTINGS, Checkerboard())
+    assert found["values"] == {"latency_s": 0.1}
+    [told] = found["ignored"]
+    assert told["why"] == "never measured; 100 ms are waited for after each flip"
+    assert "latency_s" not in calibrations.of(rig, SETTINGS, CalibrateLatency())["values"]
+    assert calibrations.of(RIG, SETTINGS, Checkerboard())["values"] == {}
+    made(store, CalibrateLatency(), {"latency_s": 0.02})
+    found = calibrations.of(rig, SETTINGS, Checkerboard())
+    assert found["values"] == {"latency_s": 0.02}
+    assert found["ignored"] == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -64,6 +65,25 @@ def test_it_ends_when_covered_or_out_of_time() -> None:
     assert method.enough({"coverage": 0.5}, 10.0) == ""
     assert method.enough({"coverage": 0.93}, 10.0).startswith("93.0% of the lit pixels")
     assert method.enough({"coverage": 0.5}, 61.0).startswith("the time limit of 60 s, at 50.0%")
+
+
+def test_a_circle_that_covers_no_more_ends_after_some_turns_in_use() -> None:
+    method, motion = planned(replace_spec(KNOWN, feed_mm_s=40.0))
+    turn_s = math.tau * motion.radius_mm / motion.feed_mm_s
+    rate, said, used, clouded = 25.0, "", 0.0, 0.0
+    for k in range(100_000):
+        seconds = k / rate
+        if 4.0 < seconds < 4.0 + 10 * turn_s:
+            clouded += 1  # nothing can be covered then, and it is no turn
+        else:
+            used += 1
+        coverage = min(0.97, 0.4 * seconds) + 0.0002 * (k % 2)
+        summary = {"frames": used, "unused": clouded, "coverage": coverage}
+        if said := method.enough(summary, seconds):
+            break
+    assert "97.0% of the lit pixels are covered, 99.5% wanted: 5 turns covered no more" in said
+    assert seconds == pytest.approx(15 * turn_s, rel=0.6)
+    assert seconds > 12 * turn_s
 
 
 @pytest.mark.parametrize(

@@ -60,6 +60,7 @@ def test_a_wrong_tone_curve_shows_in_the_residual() -> None:
             pair.update(np.rint(light ** (1 / 2.2) * 65535).astype(np.uint16), observation)
         found[tone] = pair.result().facts
     assert abs(found["gamma:2.2"]["complement_residual"]) < 0.001
-    assert found["gamma:2.2"]["advice"] == []
+    # a picture whose pixels are all different may be noise for all that one picture tells
+    assert not [line for line in found["gamma:2.2"]["advice"] if "show no pattern" not in line]
     assert abs(found["linear"]["complement_residual"]) > 0.05
     assert "tone" in found["linear"]["advice"][0]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from daemon.scans import catalog
 from daemon.scans.method import Expose
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.frameset import UNCHECKED
 from daemon.separation.radiometry import Response
 from daemon.separation.sinusoid import LeastSquares
 from protocol.scans import Sinusoid as Spec
@@ -93,7 +94,8 @@ def test_components_and_phase_come_back(count: int, leakage: float, ambient: flo
     apart = (found.planes["phase"] - phi + np.pi) % tau - np.pi
     assert np.abs(apart).max() < 1e-3
     assert found.facts["mean_ratio"] == pytest.approx(1.0, abs=1e-3)
-    assert found.facts["advice"] == []
+    # a picture whose pixels are all different may be noise for all that three phases tell
+    assert not [line for line in found.facts["advice"] if "show no pattern" not in line]
 
 
 @pytest.mark.parametrize("count", [3, 7, 25])
@@ -227,5 +229,5 @@ def test_phases_declared_wrongly_are_told_of() -> None:
         for index, frame in enumerate(frames):
             estimator.update(frame, Observation(pattern=index))
         advice[phases] = estimator.result().facts["advice"]
-    assert advice[8] == []
+    assert advice[8] == [UNCHECKED]
     assert "--phases" in advice[4][0]

@@ -41,7 +41,9 @@ def bench(pixel_format: PixelFormat = PixelFormat.MONO12) -> Bench:
     )
 
 
-def run(spec: AnyScan, shadow: bool = False, pixel_format: str = "Mono12") -> Measurement:
+def run(
+    spec: AnyScan, shadow: bool = False, pixel_format: str = "Mono12", texture: float = 0.0
+) -> Measurement:
     """All steps of a method on the made scene, as the daemon takes them."""
     rng = np.random.default_rng(3)
     method = catalog.method_for(spec, bench(PixelFormat(pixel_format)))
@@ -49,7 +51,7 @@ def run(spec: AnyScan, shadow: bool = False, pixel_format: str = "Mono12") -> Me
     index = frames = 0
     while (step := method.step(index, estimator.summary())) is not None:
         if isinstance(step, Expose):
-            light = seen(step, shadow)
+            light = seen(step, shadow, texture)
             for sub in range(step.frames):
                 noisy = light + rng.normal(BLACK, 2.0, light.shape)
                 pixels = np.asarray(np.rint(noisy), dtype=np.uint16)
@@ -64,7 +66,7 @@ def run(spec: AnyScan, shadow: bool = False, pixel_format: str = "Mono12") -> Me
     return result
 
 
-def seen(step: Expose, shadow: bool) -> NDArray[Any]:
+def seen(step: Expose, shadow: bool, texture: float) -> NDArray[Any]:
     if step.pattern is None:
         return np.full((HEIGHT, WIDTH), AMBIENT)
     image = patterns.render(step.pattern, PROJECTOR.width, PROJECTOR.height) / np.float32(255)
@@ -73,6 +75,7 @@ def seen(step: Expose, shadow: bool) -> NDArray[Any]:
     direct = DIRECT * cv2.remap(blurred, COLUMN, ROW, cv2.INTER_LINEAR)
     if shadow:
         direct[:, :40] = 0
+    direct *= 1 + texture * np.sin(1.9 * X + 1.3 * Y)
     return np.asarray(direct + GLOBAL * sent.mean() + AMBIENT)
 
 
@@ -90,6 +93,13 @@ def test_points_are_found_and_global_light_is_what_it_was_made(pixel_format: str
     plot = measured.plots["patch_size"]
     assert [c.name for c in plot.curves] == ["A", "wall"]
     assert plot.curves[0].y[0] == 1.0
+
+
+def test_a_surface_full_of_detail_is_not_taken_for_noise() -> None:
+    spec = VerifyPatchSize(points=POINTS[1:], sizes=(5, 7, 11), average=8)
+    [point] = run(spec, texture=0.6).facts["points"]
+    assert point["projector"] == pytest.approx([COLUMN[45, 60], ROW[45, 60]], abs=0.3)
+    assert point["global"] == pytest.approx([GLOBAL] * 3, rel=0.08)
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from protocol.scans import AnyScan
 
 FULL = 4095
 BLACK = 64
+OWN_US = 10_000.0
 
 
 @dataclass
@@ -67,6 +68,7 @@ class VirtualScene:
         return Bench(
             CameraInfo(self.width, self.height, PixelFormat.BAYER_RG12, black_level=BLACK),
             ProjectorInfo(self.width, self.height, refresh_hz=60),
+            exposure_us=OWN_US,
         )
 
     def frame(self, step: Expose, rng: np.random.Generator) -> NDArray[np.uint16]:
@@ -82,7 +84,7 @@ class VirtualScene:
                 )
                 emitted = np.asarray(blurred, np.float32)
             light = np.add(*self.operator.render(self.operator.light(emitted), "RG"))
-        counts = light * self.level * (FULL - BLACK)
+        counts = light * self.level * (FULL - BLACK) * ((step.exposure_us or OWN_US) / OWN_US)
         shot = np.sqrt(np.maximum(counts, 0) * FULL / self.electrons)
         noisy = counts + rng.standard_normal(counts.shape) * np.hypot(shot, self.read) + BLACK
         return np.asarray(np.rint(np.clip(noisy, 0, FULL)), np.uint16)

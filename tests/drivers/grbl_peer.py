@@ -20,7 +20,7 @@ import threading
 import time
 import tty
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -42,6 +42,8 @@ class Settings:
     pulloff: float = 1.0
     label: str = ""
     banner: str = "Grbl 1.1h ['$' for help]"
+    dialect: str = "Grbl"  # grblHAL, FluidNC: as their sources say it
+    chatter: list[bytes] = field(default_factory=list)  # before the banner
 
 
 @dataclass
@@ -56,6 +58,8 @@ class Faults:
     switch_missing: bool = False  # homing finds no switch: ALARM:9
     homing_s: float = 0.1
     hard_limit_at: float | None = None  # x below which a limit switch closes: ALARM:1
+    stalled: bool = False  # it says Run, and does not move
+    spoil: Callable[[bytes], bytes] | None = None  # what the line makes of what it says
     refuse: dict[str, int] = field(default_factory=dict)  # part of a line -> error code
 
 
@@ -182,6 +186,8 @@ class GrblPeer:
 
     def _welcome(self) -> None:
         self._booting = False
+        for data in self.settings.chatter:
+            self._put(data)
         self._say("")
         self._say(self.settings.banner)
         if self.state == "Alarm":
@@ -193,6 +199,8 @@ class GrblPeer:
         self._put(text.encode() + b"\r\n")
 
     def _put(self, data: bytes) -> None:
+        if self.faults.spoil is not None:
+            data = self.faults.spoil(data)
         if self._master >= 0 and not self.faults.mute:
             with contextlib.suppress(OSError):
                 os.write(self._master, data)
@@ -294,7 +302,8 @@ class GrblPeer:
     def _answer(self) -> None:
         if self.faults.noise:
             self._put(self.faults.noise.pop(0))
-        if not self._asked or self._critical or self.state == "Home":
+        silent = self.settings.dialect == "Grbl" and (self._critical or self.state == "Home")
+        if not self._asked or silent:
             return
         self._asked = False
         self._queries += 1
@@ -306,6 +315,8 @@ class GrblPeer:
         unit = 25.4 if self.settings.inches else 1.0
         offset = self.settings.offset if self.settings.work_positions else (0.0, 0.0)
         sub = "" if self.state != "Hold" else (":1" if self._v > 0 else ":0")
+        if self.settings.dialect == "grblHAL" and self.state == "Alarm":
+            sub = f":{self._alarm_code}"
         kind = "WPos" if self.settings.work_positions else "MPos"
         x, y = (self.x - offset[0]) / unit, (self.y - offset[1]) / unit
         text = f"<{self.state}{sub}|{kind}:{x:.4f},{y:.4f},0.000|FS:{self._v * 60 / unit:.0f},0"
@@ -313,6 +324,10 @@ class GrblPeer:
             text += f"|WCO:{offset[0] / unit:.4f},{offset[1] / unit:.4f},0.000"
             self._wco_in = 10
         self._wco_in -= 1
+        if self.settings.dialect == "grblHAL":
+            text += "|Ov:100,100,100|A:|H:1,3|TLR:0"
+        elif self.settings.dialect == "FluidNC":
+            text += "|Ln:12|SD:12.34,a:b.nc"
         self._say(text + ">")
 
     _queries = 0
@@ -345,8 +360,14 @@ class GrblPeer:
     def _dollar(self, line: str) -> Iterator[None]:
         s = self.settings
         if line == "$I":
-            self._say(f"[VER:1.1h.20190830:{s.label}]")
-            self._say(f"[OPT:V,15,{self.rx_size}]")
+            self._identify()
+            self._ok()
+        elif line.startswith("$/"):
+            item = self._items().get(line[2:])
+            if item is None:
+                self._say("error:3")
+                return
+            self._say(f"{line}={item}")
             self._ok()
         elif line == "$$":
             values = {
@@ -354,8 +375,10 @@ class GrblPeer:
                 22: int(s.homing), 23: 0, 110: s.rate, 111: s.rate, 112: 500, 120: s.acceleration,
                 121: s.acceleration, 122: 10, 130: s.travel[0], 131: s.travel[1], 132: 200,
             }  # fmt: skip
-            for key, value in values.items():
-                self._say(f"${key}={value:.3f}" if key > 99 else f"${key}={value}")
+            if s.dialect == "FluidNC":
+                values = {13: int(s.inches), 30: 1000, 32: 0}
+            for key, number in values.items():
+                self._say(f"${key}={number:.3f}" if key > 99 else f"${key}={number}")
             self._ok()
         elif line == "$X":
             if self.state == "Alarm":
@@ -366,6 +389,37 @@ class GrblPeer:
             yield from self._home()
         else:
             self._say("error:3")
+
+    def _identify(self) -> None:
+        s = self.settings
+        if s.dialect == "FluidNC":
+            self._say(f"[VER:3.9 FluidNC v3.9.1 (esp32-wifi) :{s.label}]")
+            self._say("[OPT:PHSW]")
+            self._say("[MSG:INFO: Machine: umbra]")
+        elif s.dialect == "grblHAL":
+            self._say(f"[VER:1.1f.20260817:{s.label}]")
+            self._say("[OPT:VNML+,100,1024,3,0]")
+            for line in ("AXS:3:XYZ", "NEWOPT:ENUMS,RT+,TC,SED", "FIRMWARE:grblHAL", "SIGNALS:D"):
+                self._say(f"[{line}]")
+        else:
+            self._say(f"[VER:1.1h.20190830:{s.label}]")
+            self._say(f"[OPT:V,15,{self.rx_size}]")
+
+    def _items(self) -> dict[str, str]:
+        """FluidNC's config.yaml, as far as it is asked for."""
+        s = self.settings
+        values: dict[str, str] = {}
+        for name, travel in zip("xy", s.travel, strict=True):
+            axis = f"axes/{name}/"
+            values[axis + "max_rate_mm_per_min"] = f"{s.rate:.3f}"
+            values[axis + "acceleration_mm_per_sec2"] = f"{s.acceleration:.3f}"
+            values[axis + "max_travel_mm"] = f"{travel:.3f}"
+            values[axis + "soft_limits"] = str(s.soft_limits).lower()
+            if s.homing:
+                values[axis + "homing/cycle"] = "1"
+                values[axis + "homing/mpos_mm"] = "0.000"
+                values[axis + "homing/positive_direction"] = "true"
+        return values
 
     def _home(self) -> Iterator[None]:
         if not self.settings.homing:
@@ -380,6 +434,7 @@ class GrblPeer:
             yield
         if self.faults.switch_missing:
             self._say("ALARM:9")
+            self._alarm_code = 9
             self._ok()
             self.state = "Alarm"
             self._boot(0.5)
@@ -450,8 +505,11 @@ class GrblPeer:
         self._critical = True
         self._blocks.clear()
         self._v = 0.0
+        self._alarm_code = code
         self._say(f"ALARM:{code}")
         self._say("[MSG:Reset to continue]")
+
+    _alarm_code = 0
 
     # ------------------------------------------------------------ motion
 
@@ -460,6 +518,8 @@ class GrblPeer:
         if self.state == "Idle" and self._blocks and self._running is None and not self._rx:
             self.state = "Run"  # auto-start when no more lines come
         if self.state not in {"Run", "Jog", "Hold"} or self._critical:
+            return
+        if self.faults.stalled and not self._holding:
             return
         a = self.settings.acceleration
         left = self._left()

@@ -495,12 +495,10 @@ def hdmi(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Dlpc350Projector]:  # fmt: skip
     """The board's video port is the X server's real picture."""
-    from drivers import display
     from drivers.clock import RealClock
 
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
     monkeypatch.setenv("DISPLAY", server)
-    monkeypatch.setattr(display, "MEASURED", 4)
     monkeypatch.setattr(dlpc350, "POLL_S", 0.001)
     board.video = lambda: screenshot(server)
     device = make(RealClock(), flash=[], display={"latency_frames": 1.0}, layout="square")

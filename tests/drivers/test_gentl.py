@@ -1,4 +1,5 @@
-"""The GenTL driver over the producer that the genicam package carries: a toy with three cameras."""
+"""The GenTL driver over two producers: the one that the genicam package carries (three cameras,
+free-running), and one of ours with triggers, a clock, packed 12 bit mosaics and faults."""
 
 from __future__ import annotations
 
@@ -16,8 +17,11 @@ from drivers.base import (
     Acquisition,
     CameraSettings,
     Context,
+    DeviceError,
+    DeviceGarbled,
     DeviceLost,
     DeviceRefused,
+    DeviceTimeout,
     Frame,
     PixelFormat,
 )
@@ -29,6 +33,7 @@ except UnknownDriver as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
 from drivers.gentl import GentlCamera, GentlOptions
+from tests.drivers import gentl_peer
 
 PACKAGE = importlib.util.find_spec("genicam")
 assert PACKAGE is not None
@@ -165,3 +170,111 @@ def test_settings_survive_a_reconnection(cam: GentlCamera) -> None:
     before = cam.configure(CameraSettings(pixel_format=PixelFormat.MONO8, roi=(0, 0, 160, 120)))
     cam.connect()
     assert cam.settings() == before
+
+
+# ---------------------------------------------------------------- our own producer
+
+
+@pytest.fixture(scope="module")
+def producer(tmp_path_factory: pytest.TempPathFactory) -> str:
+    if not gentl_peer.compiler():
+        pytest.skip("no C compiler for the producer: apt install gcc")
+    return str(gentl_peer.build(tmp_path_factory.mktemp("producer")))
+
+
+@pytest.fixture
+def toy(producer: str) -> Iterator[GentlCamera]:
+    made = make(producer=producer, serial="T12", exposure_us=1000.0)
+    made.connect()
+    yield made
+    made.close()
+
+
+def several(cam: GentlCamera) -> list[Frame]:
+    return [grab(cam) for _ in range(20)]
+
+
+REGIONS = [(0, 0, 64, 48), (1, 0, 31, 17), (0, 1, 9, 5), (3, 5, 7, 7)]
+
+
+@pytest.mark.parametrize("native", ["BayerRG12", "BayerRG12p", "BayerRG12Packed"])
+@pytest.mark.parametrize("padding", [0, 3])
+def test_12_bit_mosaics_are_exact_and_keep_their_order_at_odd_corners(
+    producer: str, native: str, padding: int
+) -> None:
+    cam = make(producer=producer, serial="", pixel_format=native, features={"PaddingX": padding})
+    cam.connect()
+    try:
+        for roi, order in zip(REGIONS, ("RG", "GR", "GB", "BG"), strict=True):
+            cam.configure(CameraSettings(roi=roi))
+            cam.start(Acquisition.SOFTWARE)
+            cam.trigger()
+            frame = grab(cam)
+            cam.stop()
+            assert cam.info().pixel_format.value == f"Bayer{order}12"
+            assert cam.facts()["pixel_format"] == native.replace("RG", order)
+            np.testing.assert_array_equal(frame.pixels, gentl_peer.sensor(*roi))
+        cam.connect()  # settings come back, the order with them
+        assert cam.settings().roi == REGIONS[-1]
+        assert cam.info().pixel_format is PixelFormat.BAYER_BG12
+        cam.configure(CameraSettings(roi=REGIONS[0], pixel_format=PixelFormat.BAYER_RG12))
+        assert cam.facts()["pixel_format"] == native
+    finally:
+        cam.close()
+
+
+def test_its_clock_says_when_a_triggered_frame_was_exposed(toy: GentlCamera) -> None:
+    assert toy.info().triggers == ("software", "none")
+    toy.start(Acquisition.SOFTWARE)
+    for k in range(3):
+        start, end = toy.trigger()
+        frame = grab(toy)
+        assert frame.sequence == k
+        assert start - MS < frame.start_ns < end + 20 * MS
+        assert frame.end_ns - frame.start_ns == 1 * MS
+    with pytest.raises(DeviceTimeout, match="trigger again"):
+        grab(toy, 0.05)
+
+
+def test_frames_that_were_lost_or_broken_are_counted(toy: GentlCamera) -> None:
+    toy.configure(CameraSettings(frame_rate_hz=200.0))
+    toy.start(Acquisition.FREE)
+    assert grab(toy).sequence == 0
+    nodes = toy._nodes("test")
+    nodes.set("Skip", 4)
+    numbers = [grab(toy).sequence for _ in range(10)]
+    assert numbers[-1] == 10 + 4
+    nodes.set("Break", 2)
+    frames = [grab(toy) for _ in range(10)]
+    assert sum(f.incomplete for f in frames) == 2
+    assert toy.facts()["incomplete"] == 2
+    whole = [f.sequence for f in frames if not f.incomplete]
+    assert whole == sorted(set(whole))
+    assert whole[-1] == 14 + 10
+
+
+def test_a_camera_that_is_unplugged_is_lost_and_comes_back(toy: GentlCamera) -> None:
+    before = toy.configure(CameraSettings(roi=(3, 5, 7, 7), exposure_us=2000.0))
+    toy.start(Acquisition.FREE)
+    grab(toy)
+    toy._nodes("test").set("Vanish", 1)
+    with pytest.raises(DeviceLost):
+        several(toy)
+    with pytest.raises(DeviceError):
+        toy.check()
+    with pytest.raises(DeviceLost):
+        toy.safe()
+    toy.connect()  # the library is opened anew: it is plugged in again
+    assert toy.settings() == before
+    toy.start(Acquisition.FREE)
+    np.testing.assert_array_equal(grab(toy).pixels, gentl_peer.sensor(3, 5, 7, 7))
+    assert before.pixel_format is PixelFormat.BAYER_BG12
+
+
+def test_a_frame_in_another_format_than_was_set_is_garbled(toy: GentlCamera) -> None:
+    toy.start(Acquisition.FREE)
+    grab(toy)
+    toy._nodes("test").set("PixelFormat", "BayerGB12")  # as another program would
+    toy._nodes("test").set("OffsetY", 1)
+    with pytest.raises(DeviceGarbled, match="format 0x01100012 came; it was set to BayerRG12"):
+        several(toy)

@@ -8,7 +8,7 @@ import shutil
 import struct
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,16 +40,28 @@ try:
 except UnknownDriver as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
+import gphoto2 as gp  # noqa: E402
+
 from drivers.gphoto2 import GphotoCamera, GphotoOptions  # noqa: E402
 from drivers.gphoto2config import number  # noqa: E402
 from drivers.rawfile import develop  # noqa: E402
 
 
-def dng(mosaic: np.ndarray[Any, Any], *, white: int = 16383, black: int = 512) -> bytes:
-    """A mosaic as an uncompressed RGGB RAW file."""
+def dng(
+    mosaic: np.ndarray[Any, Any],
+    *,
+    white: int = 16383,
+    black: int = 512,
+    order: str = "RG",
+    margins: tuple[int, int] = (0, 0),
+) -> bytes:
+    """A mosaic as an uncompressed RAW file; `margins` are rows and columns before the picture."""
+    top, left = margins
+    cells = {"RG": (0, 1, 1, 2), "GR": (1, 0, 2, 1), "GB": (1, 2, 0, 1), "BG": (2, 1, 1, 0)}[order]
     height, width = mosaic.shape
     data = mosaic.astype("<u2").tobytes()
     matrix = struct.pack("<18i", *(v for k in range(9) for v in (int(k % 4 == 0), 1)))
+    area = struct.pack("<4I", top, left, height, width)
     entries = [
         (254, 4, 1, 0),
         (256, 4, 1, width),
@@ -64,22 +76,23 @@ def dng(mosaic: np.ndarray[Any, Any], *, white: int = 16383, black: int = 512) -
         (278, 4, 1, height),
         (279, 4, 1, len(data)),
         (33421, 3, 2, struct.pack("<HH", 2, 2)),
-        (33422, 1, 4, bytes([0, 1, 1, 2])),
+        (33422, 1, 4, bytes(cells)),
         (50706, 1, 4, bytes([1, 4, 0, 0])),
         (50708, 2, 4, b"Toy\0"),
         (50714, 4, 1, black),
         (50717, 4, 1, white),
         (50721, 10, 9, matrix),
+        (50829, 4, 4, area),
     ]
     after = 8 + 2 + 12 * len(entries) + 4
-    strip = after + len(matrix)
+    strip = after + len(matrix) + len(area)
     ifd = b""
     for tag, kind, count, stated in entries:
-        value = {273: strip, 50721: after}.get(tag, stated)
+        value = {273: strip, 50721: after, 50829: after + len(matrix)}.get(tag, stated)
         packed = value if isinstance(value, bytes) else struct.pack("<I", value)
         ifd += struct.pack("<HHI", tag, kind, count) + packed
     head = b"II*\0" + struct.pack("<IH", 8, len(entries))
-    return head + ifd + struct.pack("<I", 0) + matrix + data
+    return head + ifd + struct.pack("<I", 0) + matrix + area + data
 
 
 def before_the_lens(data: bytes) -> None:
@@ -166,11 +179,32 @@ def test_raw_gives_the_sensors_own_counts() -> None:
     cam.close()
 
 
-def test_raw_of_12_bits() -> None:
+@pytest.mark.parametrize(
+    ("order", "margins"), [("RG", (0, 0)), ("GR", (1, 3)), ("GB", (2, 1)), ("BG", (1, 2))]
+)
+def test_raw_of_12_bits_keeps_its_order_whatever_lies_before_the_picture(
+    order: str, margins: tuple[int, int]
+) -> None:
+    """LibRaw cuts at even rows and columns: what comes begins with another colour then."""
     mosaic = np.random.default_rng(0).integers(0, 4096, (64, 96), np.uint16)
-    pixels, pixel_format, black = develop(dng(mosaic, white=4095, black=256))
-    assert (pixel_format, black) == (PixelFormat.BAYER_RG12, 256)
-    np.testing.assert_array_equal(pixels, mosaic)
+    before_the_lens(dng(mosaic, white=4095, black=256, order=order, margins=margins))
+    cam = make()
+    cam.connect()
+    try:
+        top, left = (margin + margin % 2 for margin in margins)
+        height, width = (64 - top) // 2 * 2, (96 - left) // 2 * 2
+        cells = {"RG": "RGGB", "GR": "GRBG", "GB": "GBRG", "BG": "BGGR"}[order]
+        rows = [(top - margins[0]) % 2 * 2 + (left + k - margins[1]) % 2 for k in (0, 1)]
+        first = "".join(cells[k] for k in rows)
+        assert cam.info().pixel_format is PixelFormat(f"Bayer{first}12")
+        assert cam.info().black_level == 256
+        cam.start(Acquisition.SOFTWARE)
+        cam.trigger()
+        np.testing.assert_array_equal(
+            grab(cam).pixels, mosaic[top : top + height, left : left + width]
+        )
+    finally:
+        cam.close()
 
 
 def test_the_nearest_step_of_exposure_is_set_and_told(cam: GphotoCamera) -> None:
@@ -213,6 +247,52 @@ def test_pictures_that_change_or_break(cam: GphotoCamera, monkeypatch: pytest.Mo
         grab(cam)
     with pytest.raises(BadImage, match="neither JPEG nor RAW"):
         develop(b"text" * 100)
+
+
+@pytest.mark.parametrize(
+    ("code", "kind", "says"),
+    [
+        (gp.GP_ERROR_IO, DeviceLost, "connect again"),
+        (gp.GP_ERROR_IO_READ, DeviceLost, "connect again"),
+        (gp.GP_ERROR_IO_USB_FIND, DeviceLost, "connect again"),
+        (gp.GP_ERROR_IO_USB_CLAIM, DeviceRefused, "another program holds it"),
+        (gp.GP_ERROR_CAMERA_BUSY, DeviceTimeout, "wait until its card is written"),
+        (gp.GP_ERROR_TIMEOUT, DeviceTimeout, "connect again"),
+        (gp.GP_ERROR_NO_SPACE, DeviceRefused, "empty its card"),
+    ],
+)
+def test_what_the_library_says_has_a_name_and_a_remedy(
+    cam: GphotoCamera, code: int, kind: type[Exception], says: str
+) -> None:
+    """Unplugged, held by a desktop, busy, full: at each call that talks to the camera."""
+    error: BaseException = gp.GPhoto2Error(code)
+
+    class Failing:
+        def __getattr__(self, name: str) -> Any:
+            def call(*arguments: Any) -> Any:
+                raise error
+
+            return call
+
+    cam.start(Acquisition.SOFTWARE)
+    whole, cam._camera = cam._camera, Failing()
+    calls: dict[str, Callable[[], object]] = {
+        "check": cam.check,
+        "trigger": cam.trigger,
+        "grab": lambda: grab(cam),
+        "start": lambda: cam.start(Acquisition.SOFTWARE),
+    }
+    for phase, call in calls.items():
+        with pytest.raises(kind, match=f"cam: {phase}: .*{says}"):
+            call()
+        cam._acquisition = Acquisition.SOFTWARE
+    cam.safe()
+    cam.close()  # one that is gone is let go of all the same
+    whole.exit()
+    cam.connect()
+    cam.start(Acquisition.SOFTWARE)
+    cam.trigger()
+    assert not grab(cam).incomplete
 
 
 def test_halt_ends_a_blocked_grab(cam: GphotoCamera) -> None:

@@ -8,6 +8,7 @@ import statistics
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers import grbl_protocol as grbl
 from drivers.base import (
     Context,
     DeviceError,
@@ -28,7 +28,8 @@ from drivers.base import (
     StageStatus,
 )
 from drivers.clock import NS, Clock, RealClock, ScaledClock
-from drivers.grbl import GrblOptions, GrblStage
+from drivers.grbl import GrblOptions, GrblStage, faults
+from drivers.grbl import protocol as grbl
 from tests.drivers.grbl_peer import GrblPeer, Settings
 
 pytestmark = pytest.mark.timeout(20)
@@ -110,15 +111,87 @@ def test_connects_to_boards_that_reset_on_opening_and_to_those_that_do_not(
         stage.close()
 
 
-def test_grblhal_and_fluidnc_are_recognised(tmp_path: Path) -> None:
-    for text, name in [
-        ("GrblHAL 1.1f ['$' or '$HELP' for help]", "grblHAL"),
-        ("Grbl 3.7 [FluidNC v3.7.8 (wifi) '$' for help]", "FluidNC"),
-    ]:
-        with GrblPeer(tmp_path, resets_on_open=False, settings=Settings(banner=text)) as peer:
-            stage = make(peer)
-            assert stage.connect().model == name
-            stage.close()
+FLUID_VERSION = "3.9 FluidNC v3.9.1 (esp32-wifi)"
+HAL = Settings(banner="GrblHAL 1.1f ['$' or '$HELP' for help]", dialect="grblHAL", label="B")
+DISGUISED = Settings(dialect="grblHAL")  # built for compatibility, its banner says Grbl
+FLUID = Settings(
+    banner="Grbl 3.9 [FluidNC v3.9.1 (esp32-wifi) '$' for help]",
+    dialect="FluidNC",
+    chatter=[
+        b"ets Jul 29 2019 12:21:46\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\n",
+        b"\xff\xfb\x01[MSG:INFO: FluidNC v3.9.1 https://github.com/bdring/FluidNC]\r\n",
+        b"\x1b[0;32m[MSG:INFO: Machine: umbra]\x1b[0m\r\n[MSG:WARN: No SD]\r\n",
+    ],
+)
+
+
+@pytest.mark.parametrize(
+    ("made", "name", "version", "rx"),
+    [
+        (HAL, "grblHAL", "1.1f.20260817", 255),
+        (DISGUISED, "grblHAL", "1.1f.20260817", 255),
+        (FLUID, "FluidNC", "3.9 FluidNC v3.9.1 (esp32-wifi)", 127),
+        (
+            replace(FLUID, banner="Grbl 3.9 [mine]"),
+            "FluidNC",
+            "3.9 FluidNC v3.9.1 (esp32-wifi)",
+            127,
+        ),
+    ],
+)
+def test_grblhal_and_fluidnc_are_worked_with(
+    tmp_path: Path, made: Settings, name: str, version: str, rx: int
+) -> None:
+    with GrblPeer(
+        tmp_path, resets_on_open=False, settings=replace(made), speed=2, rx_bytes=1024
+    ) as peer:
+        stage = make(peer)
+        identity = stage.connect()
+        assert (identity.model, identity.firmware) == (name, version)
+        assert stage.info().travel_mm == ((-40.0, 0.0), (-40.0, 0.0))
+        assert (stage.info().max_feed_mm_s, stage.info().max_acceleration_mm_s2) == (50.0, 500.0)
+        facts = stage.facts()
+        assert (facts["homing"], facts["soft_limits"], facts["rx_bytes"]) == (True, True, rx)
+        peer.faults.homing_s = 0.6  # in which it reports Home
+        stage.home(10.0)
+        assert stage.status().state is StageState.IDLE
+        stage.circle(CENTRE, 1.5, 25.0, math.inf)
+        pump_until(stage, lambda s: len(peer.path) > 100)
+        stage.stop()
+        assert stage.status().state is StageState.IDLE
+        assert peer.most_buffered <= rx
+        stage.close()
+
+
+def test_a_fluidnc_axis_that_is_not_told_is_asked_for_by_name(tmp_path: Path) -> None:
+    made = replace(FLUID, homing=False, soft_limits=False)
+    with GrblPeer(tmp_path, resets_on_open=False, settings=made) as peer:
+        stage = make(peer, homing="here", travel_mm=[[-5, 5], [-5, 5]])
+        stage.connect()
+        assert stage.info().max_feed_mm_s == 50.0
+        assert not stage.facts()["homing"]
+        stage.home(5.0)
+        assert stage.status().position_mm == (0.0, 0.0)
+        stage.close()
+
+
+def test_numbers_mean_what_each_firmware_means_by_them() -> None:
+    assert "dual-motor" in faults.alarm(10)[0]
+    assert "emergency stop" in faults.alarm(10, "grblHAL")[0]
+    assert "spindle" in faults.alarm(10, "FluidNC")[0]
+    for code in range(10, 23):
+        assert "in alarm" not in faults.alarm(code, "grblHAL")[0]
+    for code in range(10, 19):
+        assert "in alarm" not in faults.alarm(code, "FluidNC")[0]
+    for firmware in ("grblHAL", "FluidNC"):
+        assert faults.alarm(9, firmware) == faults.alarm(9)
+        assert faults.refusal(9, firmware) == faults.refusal(9)
+        assert faults.refusal(200, firmware)[0] == "it refused (error:200)"
+    assert "emergency stop" in faults.refusal(50, "grblHAL")[0]
+    assert "another interface" in faults.refusal(120, "FluidNC")[0]
+    assert faults.is_critical(10, "grblHAL")
+    assert not faults.is_critical(10, "Grbl")
+    assert not faults.is_critical(None, "FluidNC")
 
 
 @pytest.mark.parametrize(
@@ -440,8 +513,11 @@ def test_silence_is_a_timeout_not_a_hang(peer: GrblPeer, homed: GrblStage) -> No
     with pytest.raises(DeviceTimeout, match="no status report"):
         pump_until(homed, lambda s: False)
     for call in (homed.status, homed.safe, homed.resume):
-        with pytest.raises(DeviceTimeout):
+        with pytest.raises(DeviceTimeout, match=r"within 0\.6 s"):  # it is known to be silent
             call()
+    peer.faults.mute = False
+    homed.safe()
+    assert homed.status().state is StageState.IDLE
 
 
 def test_an_unacknowledged_move_is_not_sent_again(peer: GrblPeer, homed: GrblStage) -> None:
@@ -576,6 +652,127 @@ def test_pulled_and_back_under_another_name(peer: GrblPeer, homed: GrblStage) ->
     pump_until(homed, at_rest)
 
 
+def work_on(stage: GrblStage, rng: random.Random) -> None:
+    while True:
+        stage.home(10.0)
+        stage.circle(CENTRE, 1.5, FEED, math.inf)
+        end = time.monotonic() + rng.uniform(0.0, 0.2)
+        while time.monotonic() < end:
+            stage.pump()
+            time.sleep(0.005)
+        rng.choice([stage.stop, stage.hold, stage.check])()
+        stage.stop()
+
+
+def test_pulled_at_random_moments(peer: GrblPeer, stage: GrblStage) -> None:
+    rng = random.Random(13)
+    for _ in range(6):
+        timer = threading.Timer(rng.uniform(0.0, 0.5), peer.unplug)
+        timer.start()
+        with pytest.raises(DeviceLost):
+            work_on(stage, rng)
+        timer.join()
+        assert stage.position_at(stage.clock.now_ns()) is None
+        with pytest.raises(DeviceLost):
+            stage.connect()
+        peer.plug()
+        stage.connect()
+        assert stage.status().state is StageState.UNKNOWN
+        count = len(peer.lines)
+        with pytest.raises(DeviceRefused, match="home"):
+            stage.circle(CENTRE, 1.5, FEED, 1)
+        assert len(peer.lines) == count
+
+
+def test_a_line_that_dies_under_a_write_loses_the_position(
+    homed: GrblStage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Met with the real firmware: the write saw the hang-up before the reader did."""
+
+    def dead(_data: bytes) -> None:
+        raise DeviceLost("stage", "write", "the line is dead")
+
+    monkeypatch.setattr(homed._link.port, "write", dead)
+    with pytest.raises(DeviceLost):
+        homed.check()
+    assert homed.position_at(homed.clock.now_ns()) is None
+
+
+def test_a_controller_that_runs_without_moving_is_told(peer: GrblPeer, homed: GrblStage) -> None:
+    homed.circle(CENTRE, 1.5, FEED, math.inf)
+    pump_until(homed, moving)
+    peer.faults.stalled = True
+    with pytest.raises(DeviceTimeout, match="has not moved for 2 s"):
+        pump_until(homed, lambda s: False)
+    peer.faults.stalled = False
+    homed.stop()
+    assert homed.status().state is StageState.IDLE
+
+
+def test_a_wrong_digit_in_a_report_moves_nothing(peer: GrblPeer, homed: GrblStage) -> None:
+    before = homed.status().position_mm
+    garbled = homed.facts()["garbled_lines"]
+    peer.faults.noise.append(b"<Idle|MPos:-31.000,-1.000,0.000|FS:0,0>\r\n")
+    end = time.monotonic() + 5
+    while homed.facts()["garbled_lines"] == garbled and time.monotonic() < end:
+        assert homed.status().position_mm == before
+    assert homed.facts()["garbled_lines"] == garbled + 1
+    assert homed.position_at(homed.clock.now_ns()) == before
+    peer.x = -31.0  # two that agree are believed: it was moved by somebody else
+    assert homed.status().position_mm == (-31.0, -1.0)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_whatever_comes_on_the_line_every_call_ends(tmp_path: Path, seed: int) -> None:
+    """Cut, doubled, spoilt and foreign bytes at any boundary: a DeviceError at worst, and soon."""
+    rng = random.Random(seed)
+    with GrblPeer(tmp_path, resets_on_open=False, speed=4) as peer:
+        stage = make(peer)
+        peer.faults.spoil = lambda data: spoilt(data, rng)
+        ended = 0
+        for _ in range(12):
+            began = time.monotonic()
+            try:
+                stage.connect()
+                stage.home(5.0)
+                stage.circle(CENTRE, 1.5, FEED, 2)
+                for _ in range(20):
+                    stage.pump()
+                stage.stop()
+                ended += 1
+            except DeviceError:
+                ended += 1
+            if time.monotonic() > began + 0.8:
+                break  # enough of it
+        assert ended
+        peer.faults.spoil = None
+        stage.connect()
+        stage.home(10.0)
+        assert stage.status().state is StageState.IDLE
+        stage.close()
+
+
+def spoilt(data: bytes, rng: random.Random) -> bytes:
+    at = rng.randrange(len(data) + 1)
+    noise: list[bytes] = [
+        rng.randbytes(rng.randrange(1, 40)),
+        bytes(30),
+        b"x" * 10_000,
+        b"ok\r\n",
+        b"error:9\r\n",
+        b"ALARM:1\r\n",
+        b"<Idle|MPos:1,1,1>\n",
+    ]
+    kind = rng.randrange(50)
+    if kind < len(noise):
+        return data[:at] + noise[kind] + data[at:]
+    if kind == len(noise):
+        return data[:at]  # half a line
+    if kind == len(noise) + 1:
+        return data[:at] + bytes([rng.randrange(256)]) + data[at + 1 :]
+    return data
+
+
 def test_pulled_while_homing(peer: GrblPeer, stage: GrblStage) -> None:
     peer.faults.homing_s = 60.0
     timer = threading.Timer(0.2, peer.unplug)
@@ -606,6 +803,8 @@ def test_no_line_makes_the_parsers_raise(text: str) -> None:
         grbl.parse_banner(line)
         grbl.parse_build([line, f"[VER:{text}]"])
         grbl.parse_settings([line, f"${text}", f"$110={text}"])
+        assert len(grbl.plain(line)) <= len(line)
+        grbl.parse_item([line, f"$/axes/x/{text}"], "/axes/x/max_travel_mm")
 
 
 def test_a_report_is_read_in_full() -> None:
@@ -636,11 +835,11 @@ def test_a_damaged_report_is_none(line: str) -> None:
 
 def test_every_documented_alarm_and_error_has_words_and_a_remedy() -> None:
     for code in range(1, 11):
-        words, remedy = grbl.alarm(code)
+        words, remedy = faults.alarm(code)
         assert f"ALARM:{code}" in words
         assert remedy
     for code in [*range(1, 18), *range(20, 39)]:
-        words, remedy = grbl.refusal(code)
+        words, remedy = faults.refusal(code)
         assert f"error:{code}" in words
         assert "refused" not in words
         assert remedy

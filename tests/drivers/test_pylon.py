@@ -277,6 +277,34 @@ def test_pixels_are_the_picture_that_was_before_the_camera(
         cam.close()
 
 
+@pytest.mark.parametrize("native", ["BayerRG12", "BayerGB12", "BayerBG12"])
+def test_a_region_is_cut_from_the_mosaic_where_it_was_asked_for(native: str) -> None:
+    """Odd corners too. The emulation's picture has no colours: its name for the mosaic stays."""
+    cam = make(
+        pixel_format=native,
+        exposure_us=1000.0,
+        roi=(0, 0, 40, 30),
+        features={"TestImageSelector": "Testimage1"},
+    )
+    cam.connect()
+    try:
+        pictures = {}
+        for roi in ((0, 0, 40, 30), (1, 0, 31, 17), (0, 3, 9, 5), (5, 7, 7, 7)):
+            cam.configure(CameraSettings(roi=roi))
+            cam.start(Acquisition.SOFTWARE)
+            cam.trigger()
+            pictures[roi] = grab(cam).pixels
+            cam.stop()
+            assert cam.facts()["pixel_format"] == native
+        whole = pictures.pop((0, 0, 40, 30))
+        assert len(np.unique(whole)) > 50
+        assert whole.max() > 255
+        for (x, y, width, height), picture in pictures.items():
+            np.testing.assert_array_equal(picture, whole[y : y + height, x : x + width])
+    finally:
+        cam.close()
+
+
 def test_settings_survive_a_reconnection(cam: PylonCamera) -> None:
     wanted = CameraSettings(exposure_us=7000.0, pixel_format=PixelFormat.MONO12)
     before = cam.configure(wanted)

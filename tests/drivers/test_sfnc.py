@@ -95,6 +95,9 @@ class DictNodes(Nodes):
         kept = self.features[name]
         return tuple(kept[1:]) if isinstance(kept, tuple) and isinstance(kept[0], str) else ()
 
+    def code(self, name: str) -> int:
+        return self.entries(name).index(str(self.get(name)))
+
     def execute(self, name: str) -> None:
         self.done.append((name, True))
         self.clock.at += 2 * MS  # there and back

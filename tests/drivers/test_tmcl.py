@@ -25,7 +25,8 @@ from drivers.base import (
     StageState,
     StageStatus,
 )
-from drivers.tmcl import TmclOptions, TmclStage, checksum, encode, find_answer
+from drivers.tmcl import TmclOptions, TmclStage
+from drivers.tmcl_protocol import checksum, encode, find_answer
 from tests.drivers.tmcl_peer import TmclPeer
 
 pytestmark = pytest.mark.timeout(20)
@@ -166,10 +167,10 @@ def test_circles_begin_at_angle_0_and_are_followed(peer: TmclPeer, reverse: bool
     stage.connect()
     stage.home(5.0)
     stage.circle((10.0, 5.0), R, 40.0, 1.25)
-    positions = []
+    positions: list[tuple[float, float] | None] = []
 
     def follow(status: StageStatus) -> bool:
-        positions.append(stage.position_at(status.at_ns - 2_000_000))
+        positions.extend(stage.position_at(status.at_ns - ms * 10**6) for ms in (2, 20, 50, 80))
         return at_rest(status)
 
     status = pump_until(stage, follow)
@@ -280,6 +281,75 @@ def test_old_firmware_counts_speed_in_units_of_its_own(peer: TmclPeer) -> None:
     microsteps = 15.0 / (math.tau * R) * TURN
     assert (5, 4, round(microsteps / (16e6 / (2**5 * 2048 * 32)))) in peer.frames
     stage.close()
+
+
+def test_a_late_answer_is_not_taken_for_the_next_ones(peer: TmclPeer, homed: TmclStage) -> None:
+    homed.move(*point(1.0), FEED)
+    pump_until(homed, at_rest)
+    for late in ([0.35, 0.2, 0.15], [0.0, 0.35, 0.2, 0.15]):  # position, speed, again
+        peer.faults.late = list(late)
+        for _ in range(3):
+            status = homed.status()
+            assert status.state is StageState.IDLE
+            assert status.position_mm == pytest.approx(point(1.0), abs=1e-3)
+
+
+def test_what_a_halt_left_on_the_line_does_not_end_the_next_homing(
+    peer: TmclPeer, stage: TmclStage
+) -> None:
+    peer.faults.no_reference = True
+    timer = threading.Timer(0.2, stage.halt)
+    timer.start()
+    with pytest.raises(DeviceError, match="halt"):
+        stage.home(100.0)
+    timer.join()
+    peer.faults.late = [0.1, 0.1]
+    stage.halt()
+    with pytest.raises(DeviceTimeout, match="reference was not found"):
+        stage.home(0.4)
+    assert stage.status().state is StageState.UNKNOWN
+
+
+def test_another_modules_answer_is_told_from_noise(peer: TmclPeer) -> None:
+    peer.address = 7
+    with pytest.raises(DeviceGarbled, match="has address 7, not 1"):
+        make(peer).connect()
+
+
+def test_an_unsafe_moment_for_a_lost_answer_does_no_harm(peer: TmclPeer, homed: TmclStage) -> None:
+    """The target is absolute: sent twice it is reached once."""
+    peer.faults.late = [0.0, 0.45]  # of MAX_SPEED, of MOVE_TO
+    homed.move(*point(2.0), FEED)
+    assert pump_until(homed, at_rest).position_mm == pytest.approx(point(2.0), abs=1e-3)
+    assert peer.position == pytest.approx(2.0 / math.tau * TURN, abs=1)
+
+
+def work_on(stage: TmclStage, rng: random.Random) -> None:
+    while True:
+        stage.home(5.0)
+        stage.circle((10.0, 5.0), R, FEED, math.inf)
+        pump_until(stage, lambda s: rng.random() < 0.05)
+        rng.choice([stage.stop, stage.hold, stage.check])()
+
+
+def test_pulled_at_random_moments(peer: TmclPeer, stage: TmclStage) -> None:
+    rng = random.Random(12)
+    for _ in range(12):
+        timer = threading.Timer(rng.uniform(0.0, 0.25), peer.unplug)
+        timer.start()
+        with pytest.raises(DeviceLost):
+            work_on(stage, rng)
+        timer.join()
+        assert stage.position_at(stage.clock.now_ns()) is None
+        with pytest.raises(DeviceLost):
+            stage.connect()
+        peer._plug()
+        stage.connect()
+        assert stage.status().state is StageState.UNKNOWN
+        count = len(peer.frames)
+        with pytest.raises(DeviceRefused, match="home"):
+            stage.circle((10.0, 5.0), R, FEED, 1)
+        assert len(peer.frames) == count
 
 
 @settings(max_examples=100, deadline=None)

@@ -48,6 +48,12 @@ def failing(code: int) -> OSError:
     return OSError(code, os.strerror(code))
 
 
+MOSAICS = {  # names of RG mosaics, cut at (even, even), (odd, even), (even, odd), (odd, odd)
+    "RG12": ("RG12", "BA12", "GB12", "BG12"),
+    "pRCC": ("pRCC", "pgCC", "pGCC", "pBCC"),
+}
+
+
 class ToyCamera(Kernel):
     """A kernel with one camera: strict about the order of calls, as the real one is."""
 
@@ -62,12 +68,15 @@ class ToyCamera(Kernel):
         0x00981901: ("Software Trigger", 0, 1, 0),
     }
 
-    def __init__(self, *codes: str, crops: bool = True, padding: int = 0) -> None:
-        self.codes = list(codes) or ["GREY"]
+    def __init__(
+        self, *codes: str, crops: bool = True, padding: int = 0, moves: bool = False
+    ) -> None:
+        self._codes = list(codes) or ["GREY"]
+        self.moves = moves  # crops at any corner, and names the mosaic by its first pixel there
+        self.crop = [0, 0, WIDTH, HEIGHT]
         self.code = self.codes[0]
         self.crops, self.padding = crops, padding
         self.values = {k: v[3] for k, v in self.CONTROLS.items()}
-        self.crop = [0, 0, WIDTH, HEIGHT]
         self.size = (WIDTH, HEIGHT)
         self.interval = (1, 30)
         self.fault = 0  # errno of every call from now on
@@ -124,11 +133,20 @@ class ToyCamera(Kernel):
 
     # ---- what the camera does
 
+    @property
+    def codes(self) -> list[str]:
+        """Its formats, as it names them now."""
+        if not self.moves:
+            return self._codes
+        k = self.crop[0] % 2 + self.crop[1] % 2 * 2
+        return [MOSAICS[code][k] if code in MOSAICS else code for code in self._codes]
+
     def _waits(self) -> bool:
         return bool(self.values[0x00981900])
 
     def _stride(self) -> int:
-        bits = {"Y12P": 12, "pRCC": 12, "Y10P": 10, "RGB3": 24, "YUYV": 16, "MJPG": 0}
+        bits = {"Y12P": 12, "Y10P": 10, "RGB3": 24, "YUYV": 16, "MJPG": 0}
+        bits |= dict.fromkeys(MOSAICS["pRCC"], 12)
         plain = 8 if self.code in {"GREY", "RGGB"} else 16
         return self.size[0] * bits.get(self.code, plain) // 8 + self.padding
 
@@ -169,8 +187,12 @@ class ToyCamera(Kernel):
 
     def _s_selection(self, a: Any) -> None:
         a.r.width, a.r.height = min(a.r.width, WIDTH), min(a.r.height, HEIGHT)
-        a.r.left = min(a.r.left, WIDTH - a.r.width) // 2 * 2
+        a.r.left = min(a.r.left, WIDTH - a.r.width)
+        before = self.codes
+        if not self.moves:
+            a.r.left = a.r.left // 2 * 2
         self.crop = [a.r.left, a.r.top, a.r.width, a.r.height]
+        self.code = self.codes[before.index(self.code)]
 
     def _g_parm(self, a: Any) -> None:
         period = a.parm.capture.timeperframe
@@ -384,6 +406,32 @@ def test_pixels_are_unpacked(code: str, pixel_format: PixelFormat, padding: int)
     np.testing.assert_array_equal(grab(cam).pixels, picture)
 
 
+@pytest.mark.parametrize("code", ["RG12", "pRCC"])
+@pytest.mark.parametrize("padding", [0, 5])
+def test_a_mosaic_cut_at_an_odd_corner_is_named_anew(code: str, padding: int) -> None:
+    sensor = np.random.default_rng(0).integers(0, 4096, (HEIGHT, WIDTH), np.uint16)
+    toy = ToyCamera("GREY", code, padding=padding, moves=True)
+    cam = connected(toy, pixel_format=code)
+    regions = [(0, 0, 32, 24), (1, 0, 32, 24), (0, 3, 20, 12), (5, 7, 10, 8)]
+    for k, roi in enumerate(regions):
+        cam.configure(CameraSettings(roi=roi))
+        order = ("RG", "GR", "GB", "BG")[k]
+        assert cam.info().pixel_format is PixelFormat(f"Bayer{order}12")
+        assert cam.facts()["pixel_format"] == MOSAICS[code][k]
+        x, y, width, height = roi
+        picture = sensor[y : y + height, x : x + width]
+        rows = [csi2_12(r[None]) if code == "pRCC" else r.tobytes() for r in picture]
+        toy.payload = b"".join(row + bytes(padding) for row in rows)
+        cam.start(Acquisition.FREE)
+        np.testing.assert_array_equal(grab(cam).pixels, picture)
+        cam.stop()
+    before = cam.settings()
+    cam.connect()  # the camera kept its corner, the option names the format of another
+    assert cam.settings() == before
+    cam.configure(CameraSettings(roi=regions[0], pixel_format=PixelFormat.BAYER_BG12))
+    assert cam.info().pixel_format is PixelFormat.BAYER_RG12
+
+
 def test_what_webcams_have_is_decoded_to_rgb() -> None:
     colour = (200, 60, 30)
     ok, jpeg = cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), colour[::-1], np.uint8))
@@ -460,7 +508,7 @@ def test_triggers_by_the_controls_that_a_driver_has() -> None:
     assert not toy.values[0x00981900]
     grab(cam)
     plain = connected(ToyCamera())
-    with pytest.raises(DeviceRefused, match="it has no software trigger; it has none"):
+    with pytest.raises(DeviceRefused, match="it has no software trigger; it can only run free"):
         plain.start(Acquisition.SOFTWARE)
 
 

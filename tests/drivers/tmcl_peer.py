@@ -12,6 +12,7 @@ import select
 import threading
 import time
 import tty
+from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,6 +28,7 @@ class Faults:
     statuses: dict[int, int] = field(default_factory=dict)  # command -> status to answer with
     no_reference: bool = False
     blocked: bool = False  # told to turn, it stands
+    late: list[float] = field(default_factory=list)  # s, by which the next answers are late
 
 
 class TmclPeer:
@@ -37,6 +39,7 @@ class TmclPeer:
         self.faults = Faults()
         self.frames: list[tuple[int, int, int]] = []  # command, type, value
         self.module = module
+        self.address = 1
         self.axis = {140: resolution, 4: 20_000, 154: 5}
         self.position = 1234.0
         self.acceleration = 2_000_000.0  # microsteps a second squared
@@ -46,6 +49,7 @@ class TmclPeer:
         self._search_until: float | None = None
         self._stop = threading.Event()
         self._buffer = b""
+        self._out: deque[tuple[float, bytes]] = deque()  # answers, and when they go; in order
         self._plug()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -58,8 +62,10 @@ class TmclPeer:
         os.set_blocking(self._master, False)
 
     def unplug(self) -> None:
-        os.close(self._master)
-        self._master = -1
+        master, self._master = self._master, -1
+        os.close(master)
+        self._out.clear()
+        self._buffer = b""
 
     def __enter__(self) -> TmclPeer:
         self._thread.start()
@@ -77,13 +83,16 @@ class TmclPeer:
             if self._master < 0:
                 time.sleep(TICK_S)
                 continue
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, ValueError):  # pulled in between
                 if select.select([self._master], [], [], TICK_S)[0]:
                     self._buffer += os.read(self._master, 512)
             while len(self._buffer) >= 9:
                 frame, self._buffer = self._buffer[:9], self._buffer[9:]
                 self._answer(frame)
             now = time.monotonic()
+            while self._out and self._out[0][0] <= now and self._master >= 0:
+                with contextlib.suppress(OSError):
+                    os.write(self._master, self._out.popleft()[1])
             self._advance(now - last)
             last = now
             time.sleep(TICK_S)
@@ -151,7 +160,7 @@ class TmclPeer:
         return int(self._search_until is not None)
 
     def _send(self, command: int, status: int, value: int) -> None:
-        body = bytes([2, 1, status, command]) + value.to_bytes(4, "big", signed=True)
+        body = bytes([2, self.address, status, command]) + value.to_bytes(4, "big", signed=True)
         check = sum(body) & 0xFF
         if self.faults.damage > 0:
             self.faults.damage -= 1
@@ -163,8 +172,8 @@ class TmclPeer:
             self.faults.drop -= 1
             return
         if not self.faults.mute:
-            with contextlib.suppress(OSError):
-                os.write(self._master, data)
+            late = self.faults.late.pop(0) if self.faults.late else 0.0
+            self._out.append((time.monotonic() + late, data))
 
 
 def _wrapped(value: int) -> int:

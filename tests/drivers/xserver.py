@@ -14,12 +14,16 @@ import pytest
 from numpy.typing import NDArray
 
 
+def screen_tools_missing() -> str:
+    """The programs that `xvfb` and `screenshot` need and that are not there; "" if all are."""
+    return " and no ".join(tool for tool in ("Xvfb", "xwd") if shutil.which(tool) is None)
+
+
 @contextmanager
 def xvfb(width: int, height: int) -> Iterator[str]:
     """A display of that size; gives its DISPLAY. Skips where there is no Xvfb."""
-    missing = [tool for tool in ("Xvfb", "xwd") if shutil.which(tool) is None]
-    if missing:
-        pytest.skip(f"no {' and no '.join(missing)}: apt install xvfb x11-apps")
+    if missing := screen_tools_missing():
+        pytest.skip(f"no {missing}: apt install xvfb x11-apps")
     told, tell = os.pipe()
     server = subprocess.Popen(
         ["Xvfb", "-displayfd", str(tell), "-screen", "0", f"{width}x{height}x24",

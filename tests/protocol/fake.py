@@ -277,8 +277,9 @@ class FakeRig:
             case m.GetPreview() | m.Snap():
                 name = "preview" if isinstance(command, m.GetPreview) else "frame"
                 return m.Picture(facts={"saturated": 0}), {name: np.zeros((4, 4, 3), np.uint8)}
-            case m.SetCamera(settings=settings):
-                return m.Camera(settings=settings), {}
+            case m.SetCamera(settings=settings, auto_exposure=auto):
+                facts = {"exposure_us": 400.0, "brightest": 0.55, "problem": "too dark"}
+                return m.Camera(settings=settings, facts=facts if auto else {}), {}
             case (
                 m.GetStage() | m.StageHome() | m.StageMove() | m.StageCircle() | m.StageStop()
                 | m.StageUnlock()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,9 @@ import pytest
 from protocol import messages as m
 from protocol.cli.app import SECTIONS, run
 from protocol.cli.exits import Exit, exit_of
+from protocol.cli.rig import _followed
 from protocol.cli.watch import show_progress
+from protocol.connection import Notice
 from protocol.errors import Code, ErrorInfo, UmbraError
 from protocol.messages import RunState
 from protocol.scans import Checkerboard, Radiometry, Reference, TwoImage
@@ -467,6 +469,19 @@ def test_keys_from_new_to_revoked(tmp_path: Path, capsys: Captured) -> None:
     assert "no key named anna" in capsys.readouterr().err
 
 
+def test_auto_exposure_is_asked_for_after_the_other_settings(rig: Rig, capsys: Captured) -> None:
+    assert run(["camera", "--auto-exposure", "--exposure-us", "500", "--gain", "6"]) == Exit.OK
+    sent = [r.command for r in rig.requests if isinstance(r.command, m.SetCamera)]
+    assert sent == [
+        m.SetCamera(settings=m.CameraSettings(gain=6.0)),
+        m.SetCamera(settings=m.CameraSettings(exposure_us=500.0), auto_exposure=True),
+        m.SetCamera(),
+    ]
+    told = capsys.readouterr()
+    assert "55.0% of full scale" in told.out
+    assert told.err.strip() == "umbra: too dark"
+
+
 # ---------------------------------------------------------------- stage, doctor, devices, log
 
 
@@ -477,6 +492,9 @@ def test_stage_moves_are_asked_for_as_they_are_typed(rig: Rig, capsys: Captured)
     assert run(["stage", "move", "10", "12"]) == Exit.OK
     assert asked(rig, m.StageMove).feed_mm_s == 10.0  # half of the fastest
     assert "1.000, 2.000 mm" in capsys.readouterr().out
+    assert run(["stage", "move", "-10.5", "-12", "--feed", "4"]) == Exit.OK  # no option
+    there = asked(rig, m.StageMove)
+    assert (there.x_mm, there.y_mm) == (-10.5, -12.0)
     assert run(["stage", "home", "--timeout", "7"]) == Exit.OK
     assert asked(rig, m.StageHome).timeout_s == 7.0
     assert run(["stage", "circle", "1", "2", "3", "--wait"]) == Exit.USAGE  # it has no end
@@ -495,16 +513,57 @@ def test_the_doctor_exits_as_he_found(rig: Rig, capsys: Captured) -> None:
     assert run(["doctor"]) == Exit.FAILED
 
 
-def test_a_log_that_goes_on(rig: Rig, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
-    from protocol.cli import rig as module
+def test_a_log_that_goes_on() -> None:
+    def record(event: str, run: str = "") -> dict[str, str]:
+        return {"event": event, "run": run}
 
-    records = [{"event": "one", "timestamp": "1"}, {"event": "two", "timestamp": "2"}]
-    rounds = iter([records[:1], records[:1], records])
+    def notice(event: str, run: str = "", *, gap: bool = False) -> Notice:
+        body = m.Logged(record=record(event, run))
+        told = m.Event(topic="log", sequence=1, epoch="e", utc="", body=body)
+        return Notice(event=told, arrays={}, gap=gap)
+
+    came = iter([notice("one"), notice("two"), notice("four", gap=True), None, notice("six")])
+    kept = [record("one")]
+
+    class Events:
+        def next(self, timeout_s: float) -> Notice | None:
+            found = next(came)
+            if found is None:
+                kept.append(record("five"))  # said while no event came through
+            elif found.gap:
+                kept.extend(map(record, ("two", "three", "four")))
+            return found
 
     class Client:
-        def log(self, run: str, limit: int) -> tuple[dict[str, str], ...]:
-            return tuple(next(rounds))
+        @contextmanager
+        def subscribe(self, *topics: str) -> Iterator[Events]:
+            assert topics == ("log",)
+            yield Events()
 
-    monkeypatch.setattr(time, "sleep", lambda _: None)
-    followed = module._followed(Client(), "", 50)  # type: ignore[arg-type]
-    assert [next(followed)["event"] for _ in range(2)] == ["one", "two"]
+        def log(self, run: str, limit: int) -> tuple[dict[str, str], ...]:
+            return tuple(kept)
+
+    followed = _followed(Client(), "", 50)  # type: ignore[arg-type]
+    names = ["one", "two", "three", "four", "five", "six"]
+    assert [next(followed)["event"] for _ in names] == names
+
+
+def test_a_runs_log_that_goes_on_is_of_that_run() -> None:
+    came = iter([{"event": "a", "run": "other"}, {"event": "b", "run": "mine"}])
+
+    class Events:
+        def next(self, timeout_s: float) -> Notice:
+            told = m.Event(
+                topic="log", sequence=1, epoch="e", utc="", body=m.Logged(record=next(came))
+            )
+            return Notice(event=told, arrays={}, gap=False)
+
+    class Client:
+        @contextmanager
+        def subscribe(self, *topics: str) -> Iterator[Events]:
+            yield Events()
+
+        def log(self, run: str, limit: int) -> tuple[dict[str, str], ...]:
+            return ()
+
+    assert next(_followed(Client(), "mine", 50))["event"] == "b"  # type: ignore[arg-type]

@@ -14,6 +14,7 @@ import pytest
 from protocol.cli.delivery import Delivery
 from protocol.cli.picture import in_terminal, png
 from protocol.cli.private import configured, toml
+from protocol.cli.separate import as_typed
 from protocol.errors import UmbraError
 
 
@@ -146,3 +147,8 @@ def test_what_a_quick_command_does_not_import(arguments: list[str], absent: list
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30
     )
     assert done.stderr.splitlines()[-1].strip() == ""
+
+
+def test_a_recordings_keys_are_named_as_they_were_typed() -> None:
+    said = as_typed("no images that match 'x*'; check `path` and `match`, leave `bits` out")
+    assert said == "no images that match 'x*'; check DIR and --match, leave `bits` out"

@@ -13,7 +13,8 @@ import umbra
 from protocol.errors import UmbraError
 from protocol.messages import RunState
 
-READY_S = 30.0
+READY_S = 60.0
+ANSWER_S = 30.0
 
 FAST_RIG = """
 [rig]
@@ -84,10 +85,13 @@ class Daemon:
         while True:
             assert self.process is not None
             assert self.process.poll() is None, self.log()
-            try:
-                return umbra.connect(endpoint or self.endpoint, timeout_s=1.0, **options)  # type: ignore[arg-type]
+            try:  # a short patience with a daemon that starts, a long one with a loaded machine
+                rig = umbra.connect(endpoint or self.endpoint, timeout_s=1.0, **options)  # type: ignore[arg-type]
             except UmbraError:
                 assert time.monotonic() < deadline, self.log()
+            else:
+                rig.timeout_s = ANSWER_S
+                return rig
 
     def log(self) -> str:
         return (self.folder / "log").read_text()
@@ -109,7 +113,7 @@ class Daemon:
             self.process.stdin.close()
 
 
-def until(true: Callable[[], bool], seconds: float = 20.0) -> None:
+def until(true: Callable[[], bool], seconds: float = 40.0) -> None:
     """Ask again and again until something is true; the wait is the question's own round trip."""
     deadline = time.monotonic() + seconds
     while not true():

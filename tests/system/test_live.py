@@ -25,7 +25,7 @@ def coming(events: EventStream, count: int) -> list[tuple[PreviewTaken, dict[str
     """The next previews by hand."""
     seen: list[tuple[PreviewTaken, dict[str, object]]] = []
     while len(seen) < count:
-        notice = events.next(10.0)
+        notice = events.next(30.0)
         assert notice is not None
         assert isinstance(notice.body, PreviewTaken)
         if not notice.body.run:
@@ -91,10 +91,10 @@ def test_a_scan_takes_the_camera(daemon: Daemon) -> None:
 
 
 def test_a_camera_that_vanishes_ends_it(daemon: Daemon) -> None:
-    daemon.configure(camera='faults = ["vanish@3"]')
+    daemon.configure(camera='faults = ["vanish@10"]')
     with daemon.start() as rig, rig.subscribe("preview") as events:
         rig.live(rate_hz=15, lease_s=60)
-        coming(events, 2)
+        coming(events, 1)
         until(lambda: "live view ended" in daemon.log())
 
         def again() -> bool:
@@ -137,3 +137,27 @@ def test_the_command_line(daemon: Daemon, tmp_path: Path) -> None:
         assert both.returncode == 0, both.stderr
         assert rig.status().state is RigState.IDLE
         assert preview("--count", "1").returncode == 2  # no terminal, no -o
+
+
+def test_a_preview_is_of_now_and_tells_its_age_where_it_is_not(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    def mean() -> float:
+        command = [sys.executable, "-m", "protocol.cli", "preview", "--rig", daemon.endpoint]
+        out = subprocess.run(
+            [*command, "--json", "-o", str(tmp_path / "a.png")],
+            check=True,
+            capture_output=True,
+            timeout=60,
+        ).stdout
+        facts = json.loads(out)["facts"]
+        assert facts["age_s"] < 30
+        return float(facts["mean"])
+
+    with daemon.start() as rig:
+        rig.show(umbra.WHITE)
+        white = mean()
+        rig.show(umbra.BLACK)
+        assert mean() < white / 2
+        before = rig.preview().facts["age_s"]
+        until(lambda: rig.preview().facts["age_s"] > before + 0.3)

@@ -139,6 +139,8 @@ def test_a_killed_mesh_scan_goes_on_to_the_same_bits(bench: Daemon) -> None:
     estimator = method.estimator()
     frames = FrameStore.open(bench.data / "runs" / run, readonly=True)
     for record in frames.records():
+        if record.missing:  # a loaded machine loses frames of a stream, and says so
+            continue
         estimator.update(frames.read(record.index), record.observation)
     again = estimator.result()
     assert isinstance(again, Components)

@@ -13,8 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from drivers.base import DeviceRefused, StageInfo
-from drivers.grbl_link import GrblLink
-from drivers.grbl_protocol import Build
+from drivers.grbl.link import GrblLink
 from drivers.track import Arc, Point
 
 Range = tuple[float, float]
@@ -91,21 +90,6 @@ class Limits:
         if not turns > 0:
             raise DeviceRefused(self.device, phase, f"{turns} turns were asked", "above 0")
         self.check_box(phase, (x - r, x + r), (y - r, y + r))
-
-
-def machine_travel(settings: dict[int, float], build: Build, axis: int) -> Range | None:
-    """Least and greatest machine position of an axis, from $130 and $131; None if not told.
-
-    Grbl homes to 0 at one end, and counts down from there wherever the switch is ($23), unless it
-    was built to set the origin at the switch (Z in $I; grblHAL: bit 3 of $22).
-    """
-    length = settings.get(130 + axis)
-    if not length:
-        return None
-    homes_low = int(settings.get(23, 0)) >> axis & 1
-    sets_origin = "Z" in build.options or int(settings.get(22, 0)) & 8
-    low = 0.0 if sets_origin and homes_low else -length
-    return low, low + length
 
 
 class Stream:

@@ -24,13 +24,15 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers import grbl_protocol as grbl
 from drivers.base import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.clock import NS, Clock
+from drivers.grbl import faults
+from drivers.grbl import protocol as grbl
 from drivers.serialport import LineReader, SerialPort
 
 REPEAT_S = 0.25  # a report takes 8 to 20 ms: this one was dropped
 QUERY_S = 1.2  # Grbl is silent for .5 s after an alarm
+STILL_SILENT_S = 0.6  # asked again after a silence: a safe state is not to wait for long
 REPLY_S = 2.0  # $$ takes .2 s at 115200 baud
 BANNER_S = 1.5  # from a soft reset, the .5 s after an alarm included
 LOST_ACK_S = 1.0  # idle for this long with lines unacknowledged
@@ -57,6 +59,7 @@ class GrblLink:
         self.was_reset = False  # a banner came that nobody had asked for
         self.refused: tuple[str, int] | None = None  # a streamed line, and its error
         self.banner: grbl.Banner | None = None
+        self.firmware = faults.Firmware.GRBL
         self.report: grbl.Report | None = None  # the last
         self.rx_bytes = 127
         self.scale = 1.0  # mm a reported unit
@@ -64,6 +67,7 @@ class GrblLink:
         self.strange_lines: deque[str] = deque(maxlen=STRANGE_KEPT)
         self.on_report: Callable[[grbl.Report], None] = lambda _report: None
         self.on_lost: Callable[[], None] = lambda: None
+        self.believes: Callable[[grbl.Report], bool] = lambda _report: True
         self._clock = clock
         self._arrived = threading.Event()
         self._interrupted = threading.Event()
@@ -75,6 +79,7 @@ class GrblLink:
         self._traffic_ns = 0  # the last line sent or acknowledged
         self._idle_since_ns: int | None = None
         self._quiet_reports = 0
+        self._silent = False  # a query was not answered, and nothing came since
 
     # ------------------------------------------------------------ opening
 
@@ -91,6 +96,7 @@ class GrblLink:
         self._reader = LineReader(self.port, self._clock, self._arrived)
         self._awaiting_banner = True
         self.banner = self.report = None
+        self.firmware = faults.Firmware.GRBL
         try:
             deadline = self._after(boot_s)
             while self.banner is None and self.report is None and self._now() < deadline:
@@ -117,6 +123,7 @@ class GrblLink:
         self.refused = None
         self._first_ask_ns = None
         self._idle_since_ns, self._quiet_reports = None, 0
+        self._silent = False
 
     def reset(self, phase: str) -> None:
         """Soft reset: everything in flight is gone. Returns after the banner. DeviceTimeout."""
@@ -172,7 +179,7 @@ class GrblLink:
     def _send(self, sent: _Sent) -> None:
         self._flight.append(sent)
         self._traffic_ns, self._idle_since_ns = self._now(), None
-        self.port.write(sent.text.encode("ascii") + b"\n")
+        self._write(sent.text.encode("ascii") + b"\n")
 
     def command(self, text: str, timeout_s: float, phase: str) -> list[str]:
         """Send a line and wait for its ok; gives what came before it.
@@ -196,7 +203,7 @@ class GrblLink:
                 "check the cable; the stage has to be connected and homed again",
             )
         if sent.answer.startswith("error:"):
-            problem, remedy = grbl.refusal(int(sent.answer[6:]))
+            problem, remedy = faults.refusal(int(sent.answer[6:]), self.firmware)
             raise DeviceRefused(self.port.device, phase, problem, remedy)
         return sent.replies
 
@@ -206,7 +213,14 @@ class GrblLink:
             self._last_ask_ns = self._now()
             if self._first_ask_ns is None:
                 self._first_ask_ns = self._last_ask_ns
-        self.port.write(byte)
+        self._write(byte)
+
+    def _write(self, data: bytes) -> None:
+        try:
+            self.port.write(data)
+        except DeviceLost:
+            self.on_lost()
+            raise
 
     def urge(self, byte: bytes) -> None:
         """From any thread: a real-time byte, and an end to the wait under way. Never raises."""
@@ -237,7 +251,8 @@ class GrblLink:
     def ask(self, phase: str) -> grbl.Report:
         """A fresh report. Asks again when one was dropped; DeviceTimeout, DeviceLost."""
         began = self._now()
-        deadline = began + round(QUERY_S * NS)
+        allowed_s = STILL_SILENT_S if self._silent else QUERY_S
+        deadline = began + round(allowed_s * NS)
         self._first_ask_ns = None
         while self._now() < deadline:
             self.realtime(grbl.STATUS)
@@ -245,12 +260,16 @@ class GrblLink:
             report = self.report
             if report is not None and self._fresh(began):
                 return report
-            if self.alarm in {1, 2} or self.was_reset:
+            if faults.is_critical(self.alarm, self.firmware) or self.was_reset:
                 break  # it answers nothing until it is reset; the caller looks
-        raise DeviceTimeout(
+        raise self._silence(phase, allowed_s)
+
+    def _silence(self, phase: str, seconds: float) -> DeviceTimeout:
+        self._silent = True
+        return DeviceTimeout(
             self.port.device,
             phase,
-            f"no status report within {QUERY_S} s",
+            f"no status report within {seconds} s",
             "check the cable and the controller's power",
         )
 
@@ -268,12 +287,7 @@ class GrblLink:
                 self.realtime(grbl.STATUS)
         elif now - self._first_ask_ns > QUERY_S * NS:
             self._first_ask_ns = None
-            raise DeviceTimeout(
-                self.port.device,
-                "poll",
-                f"no status report within {QUERY_S} s",
-                "check the cable and the controller's power",
-            )
+            raise self._silence("poll", QUERY_S)
         elif now - self._last_ask_ns > REPEAT_S * NS:
             self.realtime(grbl.STATUS)
 
@@ -321,6 +335,10 @@ class GrblLink:
             ) from reader.error
 
     def _digest(self, at_ns: int, line: str) -> None:
+        self._silent = False
+        line = grbl.plain(line)
+        if not line:
+            return
         if line == "ok" or line.startswith("error:"):
             self._acknowledge(line)
         elif line.startswith("<"):
@@ -359,7 +377,7 @@ class GrblLink:
             at_ns=at_ns,
             asked_ns=asked if asked is not None else at_ns,
         )
-        if report is None:
+        if report is None or not self.believes(report):
             self._wonder(line)
             return
         self.report = report
@@ -377,6 +395,8 @@ class GrblLink:
             self.was_reset = True
         self._awaiting_banner = False
         self.banner = banner
+        if banner.name is not faults.Firmware.GRBL:  # a compatible one may call itself Grbl
+            self.firmware = banner.name
         self._flight.clear()  # its buffers are empty now, whatever was in them
         self._first_ask_ns = None
         self._idle_since_ns, self._quiet_reports = None, 0

@@ -1,0 +1,63 @@
+"""The blur of projector and camera: from what it leaves of checkers; what it leaves of waves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import exp, pi
+
+import numpy as np
+
+_TOLD = 4
+"""Contrast up to this size tells the blur: that of larger checkers is lost to local scattering."""
+_FINE = 9
+_SIGMAS = np.arange(0.0, 3.0, 0.02)
+
+
+def of_image(contrast: Mapping[int, float]) -> float:
+    """Sigma of a Gaussian, in projector px, that a projected image is to be blurred with before it
+    is read between its pixels by linear interpolation. `contrast` by size of checkers; 0: unknown.
+    """
+    return _fitted(contrast, 1)
+
+
+def of_optics(contrast: Mapping[int, float]) -> float:
+    """Sigma of a Gaussian, in projector px, for all that blurs between the projector's levels and
+    the camera's counts, the pixels of both included. `contrast` by size of checkers; 0: unknown."""
+    return _fitted(contrast, _FINE)
+
+
+def of_wave(sigma: float, period: float, weave: float = 0.0) -> float:
+    """What a blur leaves of the amplitude of sin(x + weave sin y): exp(-2π²σ²f²), with the mean
+    square of the wave's frequency, which the weave makes higher along the other axis."""
+    return exp(-2.0 * pi**2 * sigma**2 * (1.0 + 0.5 * weave**2) / period**2)
+
+
+def _fitted(contrast: Mapping[int, float], per_pixel: int) -> float:
+    """Checkers are drawn, blurred, and sampled at places all over a pixel, each at the integer
+    shift at which its contrast is greatest; the median over places is compared with what was
+    measured, as it was measured. Between `per_pixel` points a pixel light is interpolated."""
+    told = {size: value for size, value in contrast.items() if size <= _TOLD}
+    if not told:
+        return 0.0
+    errors = [
+        sum((_contrast_left(size, sigma, per_pixel) - value) ** 2 for size, value in told.items())
+        for sigma in _SIGMAS
+    ]
+    return round(float(_SIGMAS[int(np.argmin(errors))]), 3)
+
+
+def _contrast_left(size: int, sigma: float, per_pixel: int) -> float:
+    """Of checkers of a size, at the median of all places in a pixel."""
+    drawn = np.arange(-32 * size * per_pixel, 32 * size * per_pixel)
+    x = (drawn - (per_pixel - 1) / 2) / per_pixel  # pixel n is centred at n
+    wave = np.where((drawn // (size * per_pixel)) % 2 == 0, 1.0, -1.0)
+    if sigma > 0:
+        spread = sigma * per_pixel
+        reach = int(4 * spread) + 1
+        kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / spread) ** 2)
+        wave = np.convolve(wave, kernel / kernel.sum(), mode="same")
+    shifts = np.arange(0, size, max(1, size // 4))
+    places = np.linspace(-0.5, 0.5, 11)
+    seen = np.interp(places[:, None] + shifts[None, :], x, wave)
+    greatest = np.abs(seen).max(axis=1)
+    return float(np.median(greatest[:, None] * greatest[None, :]))

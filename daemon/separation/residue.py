@@ -1,0 +1,81 @@
+"""Where a pattern came by way of a mirror: what each method's waves tell, by two signs.
+
+A pattern that lies the other way round (`handedness`) needs waves of one or two coordinates; one
+that lies finer than elsewhere (`fineness`) any pattern that the camera resolves. A flat mirror is
+told by the first alone, the rim of a ball by the second alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation.fineness import finer_pattern
+from daemon.separation.handedness import Wave, WaveSums, imbalance, reversed_pattern, strength
+
+Plane = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_UNLIKE = 0.1
+"""Imbalance of a checkerboard's waves from which the frames are not its shifts."""
+
+
+def mirrored(
+    waves: Sequence[Wave], strength: Plane, *, turning: bool, smooth: bool
+) -> tuple[Mask | None, dict[str, Any]]:
+    """Where a mirror shows the pattern, (H, W) bool or None where the frames cannot tell; facts.
+
+    `waves` and `strength` are those of `handedness.reversed_pattern`; `turning`: phases rise with
+    the projector's coordinates, so that they have a way round; `smooth`: they rise evenly, not
+    from patch to patch.
+    """
+    found: list[Mask] = []
+    by = []
+    if turning:
+        by.append("way round")
+        found.append(reversed_pattern(waves, strength))
+    finer = [finer_pattern(wave, strength, smooth=smooth) for wave in waves]
+    if all(mask is not None for mask in finer):
+        by.append("fineness")
+        found += [mask for mask in finer if mask is not None]
+    facts = {"mirrors_looked_for": bool(by), "mirrors_by": by}
+    return (np.logical_or.reduce(found) if found else None), facts
+
+
+def of_shifts(sums: WaveSums | None, deviation: Plane) -> tuple[Mask | None, dict[str, Any], bool]:
+    """`mirrored` of a scan's sums, `deviation` that of a sample; and whether the frames can be the
+    patterns that were declared, in their order.
+
+    Two waves are a checkerboard's x + y and x - y, one wave that of random patches, of which
+    nothing tells the order.
+    """
+    waves = None if sums is None else sums.waves()
+    if sums is None or waves is None:
+        return None, {"mirrors_looked_for": False}, True
+    strong = strength(waves, deviation * np.float32(sums.gain))
+    if len(waves) == 1:
+        mask, facts = mirrored(waves, strong, turning=False, smooth=False)
+        return mask, facts, True
+    unlike = imbalance(waves, strong)
+    misfit = {"pattern_misfit": None if unlike is None else round(unlike, 4)}
+    if unlike is not None and unlike > _UNLIKE:
+        return None, {"mirrors_looked_for": False, **misfit}, False
+    mask, facts = mirrored(waves, strong, turning=True, smooth=True)
+    return mask, {**facts, **misfit}, True
+
+
+NOT_SHIFTS = (
+    "the frames are not the shifts of a checkerboard that were declared, in their order "
+    "(--checker, --shift, --shifts), or something moved: see that the folder holds this scan "
+    "alone, and that its names sort in the order of the shifts"
+)
+"""Advice where `of_shifts` says that the frames are not those declared."""
+
+
+def patch_weights(patterns: int) -> NDArray[np.complex128]:
+    """Weights of `WaveSums` (patterns, 1) that give each patch of a random set a phase."""
+    turn = 2.0 * np.pi * np.arange(patterns) / patterns
+    return np.asarray(np.exp(1j * turn)[:, None], dtype=np.complex128)

@@ -1,0 +1,444 @@
+"""SDL's fullscreen window on an output: what the process of a `display` projector runs.
+
+Works under a desktop (X11, Wayland) and without one (KMSDRM), where SDL owns the output alone. The
+image is neither scaled nor filtered, the cursor is hidden, the screen saver is off.
+
+Under X11 the end of the X server ends this process, too (Xlib knows no other way), and SDL belongs
+to the thread that started it, one display a process: drivers/display.py gives it a process.
+
+`main` is that process: told one `Call` at a time over a connection, it answers with a `Reply`;
+pictures lie in shared memory. It ends when the connection does, and at no signal of a terminal or a
+service manager.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+import signal
+import sys
+import threading
+import warnings
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+import pygame
+
+from drivers.base import (
+    Context,
+    DeviceError,
+    DeviceLost,
+    DeviceRefused,
+    Identity,
+    Options,
+    Projector,
+    ProjectorInfo,
+)
+from drivers.clock import NS
+
+HINTS = {
+    "SDL_NO_SIGNAL_HANDLERS": "1",  # SIGTERM is the daemon's
+    "SDL_VIDEO_DOUBLE_BUFFER": "1",  # KMSDRM: a flip returns when it has happened
+    "SDL_RENDER_SCALE_QUALITY": "nearest",
+    "SDL_VIDEO_MINIMIZE_ON_FOCUS_LOSS": "0",  # a click on another screen must not take it down
+    "SDL_VIDEO_ALLOW_SCREENSAVER": "0",
+}
+ASSUMED_FRAMES = 6.0  # what slow projectors need
+MEASURED = 24  # flips, to learn the refresh rate
+FASTEST_HZ = 500.0  # flips that come faster do not wait for the refresh
+DRIFT = 0.1  # by which the measured rate may differ from the one in rig.toml
+NO_DISPLAY = (
+    "set DISPLAY for a desktop; without one, umbrad needs /dev/dri/card* (group video) and "
+    'video_driver = "kmsdrm"'
+)
+MASKS = {"white": 0xFFFFFF, "red": 0xFF0000, "green": 0x00FF00, "blue": 0x0000FF}
+
+
+class DisplayOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Keys of ``[projector] driver = "display"``."""
+
+    output: int | str = 0  # its number, or its name as `umbra devices --scan` prints it
+    size: tuple[int, int] | None = None  # width, height that the output must have
+    refresh_hz: Annotated[float, Meta(gt=0)] | None = None  # None: as measured at connect
+    #: from the flip to this image's light; None: nobody knows, and scans wait for ASSUMED_FRAMES
+    #: until it has been calibrated
+    latency_frames: Annotated[float, Meta(ge=0)] | None = None
+    channel: Literal["white", "red", "green", "blue"] = "white"
+    video_driver: str = ""  # SDL's name: kmsdrm, x11, wayland; "": SDL chooses
+    windowed: bool = False  # in a window of `size`, paced by the clock: to try out, no more
+
+
+class _Screen:
+    """SDL's one display in this process, and who has it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._owner: object = None
+
+    def take(self, owner: object) -> bool:
+        """Have it, unless somebody else does."""
+        with self._lock:
+            if self._owner in {None, owner}:
+                self._owner = owner
+            return self._owner is owner
+
+    def leave(self, owner: object) -> None:
+        """Let others have it."""
+        with self._lock:
+            if self._owner is owner:
+                self._owner = None
+
+
+_screen = _Screen()
+
+
+class DisplayWindow(Projector):
+    """A projector within this process; `show`, `safe` and what they give: see DisplayProjector."""
+
+    options_type = DisplayOptions
+
+    def __init__(self, name: str, options: Options, context: Context) -> None:
+        super().__init__(name, options, context)
+        assert isinstance(options, DisplayOptions)
+        self._o = options
+        self._surface: pygame.Surface | None = None
+        self._size = (0, 0)
+        self._refresh_hz = 0.0
+        self._facts: dict[str, Any] = {}
+        self._halted = threading.Event()
+        self._next = 0  # windowed: when the next refresh would be
+
+    # ------------------------------------------------------------ life
+
+    def connect(self) -> Identity:
+        """See Device. Takes half a second: the refresh rate is measured, on black."""
+        self.close()
+        if not _screen.take(self):
+            raise self._refuse(
+                "connect",
+                "another device of this rig has the display",
+                "one display a rig: SDL has but one in a process",
+            )
+        try:
+            return self._open()
+        except DeviceError:
+            self.close()
+            raise
+        except pygame.error as error:
+            self.close()
+            raise DeviceLost(
+                self.name,
+                "connect",
+                f"SDL: {error}",
+                NO_DISPLAY,
+            ) from error
+
+    def _open(self) -> Identity:
+        _start(self._o.video_driver)
+        driver = pygame.display.get_driver()
+        index = self._find(_names(driver))
+        output = pygame.display.get_desktop_sizes()[index]
+        size = self._o.size or output
+        if self._o.windowed:
+            flags = pygame.NOFRAME
+        else:
+            if size != output:
+                raise self._refuse(
+                    "connect",
+                    f"output {self._o.output} is {output[0]} x {output[1]}, "
+                    f"not {size[0]} x {size[1]}",
+                    "set the output's mode: nothing is ever scaled",
+                )
+            flags = pygame.FULLSCREEN | pygame.SCALED  # SCALED, at the output's size, is for vsync
+        with warnings.catch_warnings(record=True) as slow:  # "no fast renderer": without a GPU
+            warnings.simplefilter("always")
+            surface = pygame.display.set_mode(
+                size, flags, display=index, vsync=0 if self._o.windowed else 1
+            )
+        pygame.mouse.set_visible(False)
+        pygame.display.set_allow_screensaver(False)
+        self._surface, self._size = surface, size
+        self._check_window("connect")
+        self._refresh_hz = self._measure()
+        name = _names(driver)[index]
+        self._facts = {
+            "output": name,
+            "sdl": ".".join(map(str, pygame.get_sdl_version())),
+            "video_driver": driver,
+            "refresh_hz": round(self._refresh_hz, 3),
+            "flips_by": "timer" if slow or self._o.windowed else "output",
+            "channel": self._o.channel,
+        }
+        if self._o.latency_frames is None:
+            self._facts["assumed_latency_s"] = round(ASSUMED_FRAMES / self._refresh_hz, 6)
+        return Identity(f"display {name} {size[0]}x{size[1]}", "", f"SDL {self._facts['sdl']}")
+
+    def _find(self, names: list[str]) -> int:
+        wanted = self._o.output
+        if isinstance(wanted, int) and 0 <= wanted < len(names):
+            return wanted
+        found = [k for k, name in enumerate(names) if name == wanted]
+        if len(found) == 1:
+            return found[0]
+        there = ", ".join(f"{k} ({name})" for k, name in enumerate(names)) or "none"
+        problem = (
+            f"{len(found)} outputs are called {wanted!r}" if found else f"no output {wanted!r}"
+        )
+        raise DeviceLost(self.name, "connect", problem, f"there are {there}; is it plugged in?")
+
+    def _measure(self) -> float:
+        """Refreshes a second."""
+        if self._o.windowed:
+            return self._o.refresh_hz or 60.0
+        assert self._surface is not None
+        self._surface.fill(0)
+        moments = []
+        for _ in range(MEASURED):
+            pygame.display.flip()
+            moments.append(self.clock.now_ns())
+        rate = NS / max(1.0, float(np.median(np.diff(moments))))
+        told = self._o.refresh_hz
+        if rate > FASTEST_HZ or not pygame.display.is_vsync():
+            raise self._refuse(
+                "connect",
+                f"flips do not wait for the refresh ({rate:.0f} a second)",
+                "switch on vertical sync in the graphics driver, or use KMSDRM",
+            )
+        if told is not None and abs(rate / told - 1) > DRIFT:
+            raise self._refuse(
+                "connect",
+                f"the output refreshes at {rate:.2f} Hz, not at refresh_hz = {told:g}",
+                "set the output's mode, or leave refresh_hz out",
+            )
+        return told or rate
+
+    def check(self) -> None:
+        """See Device. Answers the window system, too: a window that does not is taken for dead."""
+        self._check_window("check")
+
+    def _check_window(self, phase: str) -> None:
+        if self._surface is None:
+            raise DeviceLost(self.name, phase, "not connected", "connect it first")
+        try:
+            closed = [
+                event
+                for event in pygame.event.get()
+                if event.type in {pygame.QUIT, pygame.WINDOWCLOSE}
+            ]
+            size, shown = pygame.display.get_window_size(), pygame.display.get_active()
+        except pygame.error as error:
+            raise DeviceLost(self.name, phase, f"SDL: {error}", "connect again") from error
+        problem = ""
+        if closed:
+            problem = "the window was closed"
+        elif not shown:
+            problem = "the window is minimised or hidden"
+        elif size != self._size:
+            problem = (
+                f"the output is now {size[0]} x {size[1]}, not {self._size[0]} x {self._size[1]}"
+            )
+        if problem:
+            raise DeviceLost(
+                self.name, phase, problem, "leave its screen alone; it is opened again"
+            )
+
+    def safe(self) -> None:
+        """See Device: black. A halt ends the wait for the light, not the flip."""
+        self._halted.clear()
+        dark_ns = self.show(np.zeros(self._size[::-1], np.uint8))
+        dark_ns += round(self._facts.get("assumed_latency_s", 0.0) * NS)
+        self.clock.wait_until(dark_ns, self._halted)
+
+    def halt(self) -> None:
+        """See Device. No flip blocks for longer than a refresh."""
+        self._halted.set()
+
+    def close(self) -> None:
+        """See Device."""
+        if _screen.take(self):
+            self._surface = None
+            pygame.display.quit()
+            _screen.leave(self)
+
+    # ------------------------------------------------------------ what it shows
+
+    def info(self) -> ProjectorInfo:
+        """See Projector."""
+        width, height = self._size
+        frames = self._o.latency_frames or 0.0
+        latency = frames / self._refresh_hz if self._refresh_hz else 0.0
+        return ProjectorInfo(width, height, self._refresh_hz, latency)
+
+    def facts(self) -> dict[str, Any]:
+        """See Device."""
+        return self._facts
+
+    def show(self, image: NDArray[np.uint8]) -> int:
+        """See Projector and the class."""
+        self._check_window("show")
+        width, height = self._size
+        if image.dtype != np.uint8 or image.shape not in {(height, width), (height, width, 3)}:
+            raise self._refuse(
+                "show",
+                f"an image of {image.shape} {image.dtype}, not {(height, width)} uint8",
+                "draw it for the size in info()",
+            )
+        self._draw(image)
+        return self._flip() + round((self._o.latency_frames or 0.0) * NS / self._refresh_hz)
+
+    def _draw(self, image: NDArray[np.uint8]) -> None:
+        assert self._surface is not None
+        if image.ndim == 3:
+            pygame.surfarray.blit_array(self._surface, image.swapaxes(0, 1))
+            return
+        pixels = pygame.surfarray.pixels2d(self._surface)  # (W, H) uint32, the surface's own
+        grey = np.uint32(0x010101 & MASKS[self._o.channel])
+        np.multiply(image, grey, out=pixels.T, dtype=np.uint32, casting="unsafe")
+
+    def _flip(self) -> int:
+        try:
+            pygame.display.flip()
+        except pygame.error as error:
+            raise DeviceLost(self.name, "show", f"SDL: {error}", "connect again") from error
+        now = self.clock.now_ns()
+        if self._o.windowed:  # no refresh to wait for: the clock stands in
+            period = round(NS / self._refresh_hz)
+            self._next = max(self._next + period, now)
+            self.clock.wait_until(self._next)
+            now = self.clock.now_ns()
+        return now
+
+    def _refuse(self, phase: str, problem: str, remedy: str) -> DeviceRefused:
+        return DeviceRefused(self.name, phase, problem, remedy)
+
+    @classmethod
+    def discover(cls) -> list[dict[str, Any]]:
+        """See Device. [] while this process shows something, or where there is no display."""
+        here = object()
+        if not _screen.take(here):
+            return []
+        try:
+            _start("")
+            names = _names(pygame.display.get_driver())
+            sizes = pygame.display.get_desktop_sizes()
+            return [
+                {
+                    "model": f"display {name} {size[0]}x{size[1]}",
+                    "serial": "",
+                    "options": {"output": name if names.count(name) == 1 else k},
+                }
+                for k, (name, size) in enumerate(zip(names, sizes, strict=True))
+            ]
+        except pygame.error:
+            return []
+        finally:
+            pygame.display.quit()
+            _screen.leave(here)
+
+
+# ---------------------------------------------------------------- the process
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """What to do: a method of the window; `shape` of the picture in the shared memory."""
+
+    method: str
+    shape: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What came of it: a value, or the kind and the words of a DeviceError."""
+
+    value: Any = None
+    error: type[DeviceError] | None = None
+    words: tuple[str, ...] = field(default=())
+
+
+def serve(calls: Connection, memory: int) -> None:
+    """Be the window that the first message describes, until the connection ends."""
+    name, options = calls.recv()
+    window = DisplayWindow(name, options, Context())
+    pixels: mmap.mmap | None = None
+    while True:
+        try:
+            call: Call = calls.recv()
+        except EOFError:
+            break
+        try:
+            if call.method == "connect":
+                value: Any = (window.connect(), window.info(), window.facts())
+                width, height = value[1].width, value[1].height
+                os.ftruncate(memory, 3 * width * height)
+                pixels = mmap.mmap(memory, 3 * width * height)
+            elif call.method == "show":
+                assert pixels is not None
+                value = window.show(np.ndarray(call.shape, np.uint8, pixels))
+            else:
+                value = getattr(window, call.method)()
+            reply = Reply(value)
+        except DeviceError as error:
+            reply = Reply(None, type(error), (error.phase, error.problem, error.remedy))
+        calls.send(reply)
+    window.close()
+
+
+def main() -> None:
+    """The process, given the file descriptors of its connection and of the shared memory."""
+    for ending in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(ending, signal.SIG_IGN)
+    serve(Connection(int(sys.argv[1])), int(sys.argv[2]))
+
+
+def _start(video_driver: str) -> None:
+    """Start SDL's video in this thread. Raises pygame.error, also where nothing can be seen."""
+    for key, value in HINTS.items():
+        os.environ.setdefault(key, value)
+    if video_driver:
+        before = os.environ.get("SDL_VIDEODRIVER")
+        os.environ["SDL_VIDEODRIVER"] = video_driver
+    try:
+        pygame.display.init()
+    finally:
+        if video_driver:
+            del os.environ["SDL_VIDEODRIVER"]
+            if before is not None:
+                os.environ["SDL_VIDEODRIVER"] = before
+    if (driver := pygame.display.get_driver()) in {"dummy", "offscreen"}:
+        raise pygame.error(f"no display was found (its {driver} driver shows nothing)")
+
+
+def _names(driver: str) -> list[str]:
+    """The outputs' names in SDL's order: the connectors' under KMSDRM, else SDL's own."""
+    count = pygame.display.get_num_displays()
+    if driver == "kmsdrm":
+        found = _connectors(Path("/sys/class/drm"))
+        if len(found) == count:
+            return found
+    library = ctypes.CDLL(pygame.base.__file__)  # SDL is among what it is linked with
+    library.SDL_GetDisplayName.restype = ctypes.c_char_p
+    return [(library.SDL_GetDisplayName(k) or str(k).encode()).decode() for k in range(count)]
+
+
+def _connectors(drm: Path) -> list[str]:
+    """Connectors with something plugged in ("HDMI-A-1"), in the kernel's order."""
+    connected = [
+        path.parent
+        for path in drm.glob("card*-*/status")
+        if path.read_text().strip() == "connected"
+    ]
+
+    def order(path: Path) -> tuple[str, int]:
+        number = path / "connector_id"
+        return path.name.partition("-")[0], int(number.read_text()) if number.exists() else 0
+
+    return [path.name.partition("-")[2] for path in sorted(connected, key=order)]

@@ -1,0 +1,129 @@
+"""A recorder on a disk that fills: nothing is lost, nothing is decided twice."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import daemon.frames
+import daemon.journal
+from daemon.durable import StorageError
+from daemon.frames import FrameStore
+from daemon.recorder import Exposed, Recorder
+from daemon.ring import Ring
+from daemon.scans.catalog import method_for
+from daemon.scans.method import Bench
+from drivers.base import CameraInfo, Frame, PixelFormat, ProjectorInfo
+from protocol.scans import TwoImage
+
+SHAPE = (12, 16)
+CAMERA = CameraInfo(SHAPE[1], SHAPE[0], PixelFormat.MONO8)
+
+
+class Disk:
+    """Writes that fail while it is full: of shards, or of the lines that acknowledge them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, full: dict[str, int]) -> None:
+        self.full = full
+        for name in full:
+            place = daemon.journal if name == "_write_at" else daemon.frames
+            monkeypatch.setattr(place, name, self._failing(name, getattr(place, name)))
+
+    def _failing(self, name: str, real: Any) -> Any:
+        def write(*args: Any, **options: Any) -> Any:
+            if self.full.get(name, 0) > 0:
+                self.full[name] -= 1
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return real(*args, **options)
+
+        return write
+
+
+class Course:
+    """What waits for room: here it is there at once."""
+
+    def __init__(self, patience: int = 100) -> None:
+        self.patience = patience
+        self.held = 0
+
+    def on_full(self, error: StorageError) -> None:
+        self.held += 1
+        if self.held > self.patience:
+            raise error
+
+    def on_taken(self, *_: object) -> None:
+        pass
+
+
+def record(frames: FrameStore, course: Course) -> Recorder:
+    """Record a two-image scan of four frames, each of one grey; not finished yet."""
+    method = method_for(TwoImage(), Bench(CAMERA, projector=ProjectorInfo(64, 48, 60.0)))
+    ring = Ring(4, SHAPE, np.dtype(np.uint8))
+    recorder = Recorder(method, frames, ring, course.on_taken, course.on_full)
+    recorder.start()
+    for index in range(4):
+        step = method.step(index, {})
+        assert step is not None
+        buffer = ring.take(1.0)
+        assert buffer is not None
+        buffer[...] = 40 + 50 * index
+        frame = Frame(buffer, index, 0, 1000, 0, 1.0)
+        recorder.put(Exposed(step=step, index=index, sub=0, frame=frame, buffer=buffer))
+    return recorder
+
+
+def store(folder: Path) -> FrameStore:
+    folder.mkdir()
+    return FrameStore.create(folder, SHAPE, np.uint8)
+
+
+@pytest.mark.parametrize("what", ["_write", "atomic_write", "_write_at"])
+def test_what_the_disk_refused_is_written_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    frames = store(tmp_path / "straight")
+    record(frames, Course()).finish()
+    frames.close()
+
+    course, frames = Course(), store(tmp_path / "full")
+    Disk(monkeypatch, {what: 3})
+    recorder = record(frames, course)
+    recorder.finish()
+    frames.close()
+    assert course.held == 3
+    assert recorder.tally.recorded == 4
+    kept = FrameStore.open(tmp_path / "full", readonly=True)
+    kept.verify()
+    assert [int(kept.read(i)[0, 0]) for i in range(4)] == [40, 90, 140, 190]
+    assert kept.records() == FrameStore.open(tmp_path / "straight", readonly=True).records()
+
+
+def test_a_run_that_ends_meanwhile_ends_with_the_disks_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = store(tmp_path / "full")
+    Disk(monkeypatch, {"_write": 100})
+    recorder = record(frames, Course(patience=2))
+    with pytest.raises(StorageError, match="the disk is full"):
+        recorder.finish()
+    assert recorder.tally.recorded == 0
+    frames.close()
+
+
+def test_after_a_failed_fsync_nothing_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(path: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    course, frames = Course(), store(tmp_path / "full")
+    monkeypatch.setattr(daemon.frames, "fsync_file", fail)
+    recorder = record(frames, course)
+    with pytest.raises(StorageError):
+        recorder.finish()
+    assert course.held == 0
+    frames.close()

@@ -1,0 +1,331 @@
+"""Frames that are not what was declared, for every pattern method: said, or harmless and shown so.
+
+The matrix of docs/theory.md, "Wrong parameters".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.scans import catalog
+from daemon.scans.method import Bench, Expose, Taken
+from daemon.separation.estimator import Components, Lighting
+from daemon.separation.frameset import UNCHECKED, FrameSet
+from daemon.separation.radiometry import Response
+from daemon.separation.single import block_mean
+from drivers.base import CameraInfo, PixelFormat
+from protocol.patterns import Axis
+from protocol.scans import (
+    Checkerboard,
+    GrayCode,
+    PatternScan,
+    Radiometry,
+    RandomBinary,
+    RandomPhase,
+    Reference,
+    SingleImage,
+    Sinusoid,
+    TwoImage,
+)
+from tests.daemon.scene import Scene
+
+Frames = list[NDArray[np.uint16]]
+
+SIGMA = 0.005
+LIGHT = Radiometry(leakage=0.02)
+NONE: tuple[Reference, ...] = ()
+BLACK_WHITE = (Reference.BLACK, Reference.WHITE)
+BOTH = (Axis.X, Axis.Y)
+
+METHODS: dict[str, PatternScan] = {
+    "checkerboard": Checkerboard(radiometry=LIGHT),
+    "checkerboard maxmin": Checkerboard(estimator="maxmin", radiometry=LIGHT),
+    "random-binary": RandomBinary(radiometry=LIGHT),
+    "random-binary maxmin": RandomBinary(estimator="maxmin", radiometry=LIGHT),
+    "two-image": TwoImage(radiometry=LIGHT),
+    "random-phase 3": RandomPhase(radiometry=LIGHT),
+    "random-phase 5": RandomPhase(phases=5, radiometry=LIGHT),
+    "sinusoid 3": Sinusoid(radiometry=LIGHT),
+    "sinusoid 8": Sinusoid(phases=8, radiometry=LIGHT),
+    "sinusoid 5 x 2": Sinusoid(phases=5, periods=(12, 20), radiometry=LIGHT),
+    "gray-code x": GrayCode(bits=7, radiometry=LIGHT),
+    "gray-code x,y": GrayCode(axes=BOTH, bits=7, radiometry=LIGHT),
+    "single-image": SingleImage(radiometry=LIGHT),
+}
+ALL = tuple(METHODS)
+SETS = ALL[:-1]  # of more than one image
+GRAY = ("gray-code x", "gray-code x,y")
+ORDERLESS = ("random-binary", "random-binary maxmin", "two-image", "random-phase 3", "sinusoid 3")
+ORDERED = tuple(name for name in SETS if name not in ORDERLESS)
+
+
+def _scene(**given: Any) -> Scene:
+    small = {"width": 96, "height": 80}
+    return Scene(
+        **({"sigma": SIGMA, "leakage": 0.02, "blur": 0.5, "ambient": 0.02} | small | given)
+    )
+
+
+@lru_cache(maxsize=64)
+def _of_right_scene(name: str, references: tuple[Reference, ...]) -> tuple[Frames, Frames]:
+    return _taken(msgspec.structs.replace(METHODS[name], references=references), _scene())
+
+
+def _taken(spec: PatternScan, scene: Scene) -> tuple[Frames, Frames]:
+    """The frames of a scan: references, and patterns."""
+    rng = np.random.default_rng(5)
+    method = catalog.method_for(spec, scene.bench())  # type: ignore[arg-type]
+    references: Frames = []
+    frames: Frames = []
+    while (step := method.step(len(references) + len(frames), {})) is not None:
+        assert isinstance(step, Expose)
+        kind = frames if step.lighting is Lighting.PATTERN else references
+        kind.append(scene.frame(step, rng))
+    return references, frames
+
+
+def _declared(spec: PatternScan, frames: Sequence[NDArray[Any]]) -> Components:
+    """What a folder of frames comes to when it is said to be a scan."""
+    height, width = frames[0].shape
+    camera = CameraInfo(width, height, PixelFormat.MONO16, recorded=True, frame_count=len(frames))
+    method = catalog.method_for(spec, Bench(camera))  # type: ignore[arg-type]
+    estimator = method.estimator()
+    for index, frame in enumerate(frames):
+        step = method.step(index, {})
+        assert step is not None
+        estimator.update(frame, method.observe(step, Taken(index, 0, incomplete=False)))
+    found = estimator.result()
+    assert isinstance(found, Components)
+    return found
+
+
+def _judged(
+    name: str,
+    references: tuple[Reference, ...],
+    wrong: Callable[[Frames], Frames] = lambda frames: frames,
+    *,
+    scene: Scene | None = None,
+    **declared: Any,
+) -> Components:
+    spec = msgspec.structs.replace(METHODS[name], references=references)
+    first, frames = _taken(spec, scene) if scene else _of_right_scene(name, references)
+    return _declared(msgspec.structs.replace(spec, **declared), [*first, *wrong(frames)])
+
+
+def _advice(components: Components) -> list[str]:
+    """Without the line that references are missing, which every folder without them gets."""
+    return [line for line in components.facts["advice"] if line != UNCHECKED]
+
+
+def _says(components: Components, *words: str) -> bool:
+    return any(word in line for line in _advice(components) for word in words)
+
+
+def _error(components: Components) -> float:
+    direct: NDArray[Any] = _scene().direct
+    if components.direct.shape != direct.shape:
+        direct = block_mean(direct.astype(np.float32), 4)
+    return float(np.sqrt(np.nanmean((components.direct - direct) ** 2))) / 65535
+
+
+references_or_not = pytest.mark.parametrize("references", [NONE, BLACK_WHITE])
+
+
+@pytest.mark.parametrize("name", ALL)
+@references_or_not
+def test_right_frames_are_told_nothing(name: str, references: tuple[Reference, ...]) -> None:
+    found = _judged(name, references)
+    assert _advice(found) == []
+    assert (UNCHECKED in found.facts["advice"]) == (not references)
+
+
+def _shuffled(frames: Frames) -> Frames:
+    return [frames[n] for n in np.random.default_rng(2).permutation(len(frames))]
+
+
+@pytest.mark.parametrize("name", ORDERED)
+@references_or_not
+def test_shuffled_frames_are_told(name: str, references: tuple[Reference, ...]) -> None:
+    words = ("in their order", "that were declared", "add up to light", "jump or run back")
+    assert _says(_judged(name, references, _shuffled), *words)
+
+
+@pytest.mark.parametrize("name", ORDERLESS)
+@references_or_not
+def test_an_order_that_makes_no_difference_makes_none(
+    name: str, references: tuple[Reference, ...]
+) -> None:
+    def back(frames: Frames) -> Frames:
+        return frames[::-1]
+
+    right, wrong = _judged(name, references), _judged(name, references, back)
+    assert _advice(wrong) == []
+    assert _error(wrong) == pytest.approx(_error(right), abs=0.002)
+
+
+@pytest.mark.parametrize("name", SETS)
+@references_or_not
+def test_a_folder_that_slipped_by_one_is_told_by_the_frame_at_its_end(
+    name: str, references: tuple[Reference, ...]
+) -> None:
+    """The first pattern is missing, and at the end is one frame of something else."""
+
+    def slipped(frames: Frames) -> Frames:
+        other = (_scene().direct * 0.3).astype(np.uint16)
+        return [*frames[1:], other]
+
+    assert _advice(_judged(name, references, slipped))
+
+
+@pytest.mark.parametrize("name", ["sinusoid 5 x 2", *GRAY, "checkerboard", "checkerboard maxmin"])
+def test_a_set_that_begins_with_its_second_frame_is_told(name: str) -> None:
+    found = _judged(name, NONE, lambda frames: [*frames[1:], frames[0]])
+    assert _says(found, "declared", "add up to light")
+
+
+@pytest.mark.parametrize("name", SETS)
+@references_or_not
+def test_a_frame_in_two_places_is_told(name: str, references: tuple[Reference, ...]) -> None:
+    found = _judged(name, references, lambda frames: [frames[0], frames[0], *frames[2:]])
+    assert _says(found, "pattern 2's frame is pattern 1's frame over again, bit by bit")
+
+
+@pytest.mark.parametrize("name", SETS)
+@references_or_not
+def test_a_pattern_that_was_exposed_twice_is_told(
+    name: str, references: tuple[Reference, ...]
+) -> None:
+    def twice(frames: Frames) -> Frames:
+        noise = np.random.default_rng(9).normal(0, SIGMA * 65535, frames[0].shape)
+        again = np.clip(frames[0] + noise, 0, 65535).astype(np.uint16)
+        return [frames[0], again, *frames[2:]]
+
+    words = ("hardly differ", "show no pattern", "the pattern itself shows")
+    assert _says(_judged(name, references, twice), *words)
+
+
+@pytest.mark.parametrize("name", SETS)
+@references_or_not
+def test_a_black_frame_among_the_patterns_is_told(
+    name: str, references: tuple[Reference, ...]
+) -> None:
+    def black(frames: Frames) -> Frames:
+        noise = np.random.default_rng(3).normal(1500, 300, frames[1].shape)
+        return [frames[0], np.clip(noise, 0, 65535).astype(np.uint16), *frames[2:]]
+
+    words = ("stand out by their light", "add up to light", "differ in their light")
+    assert _says(_judged(name, references, black), *words)
+
+
+@pytest.mark.parametrize("name", [n for n in SETS if n != "two-image"])
+@references_or_not
+def test_a_lamp_that_was_switched_on_during_the_scan_is_told(
+    name: str, references: tuple[Reference, ...]
+) -> None:
+    def later(light: NDArray[Any], step: Expose) -> NDArray[Any]:
+        on = step.lighting is Lighting.PATTERN and step.index >= 2
+        return light + 0.05 * 65535 if on else light
+
+    # random patches light a small scene less evenly from pattern to pattern
+    found = _judged(name, references, scene=_scene(width=160, height=128, change=later))
+    words = ("stand out by", "changed during the scan", "add up to light", "the pattern itself")
+    assert _says(found, *words, "from a sinusoid")
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_lamp_that_was_switched_on_after_the_references_is_told(name: str) -> None:
+    def later(light: NDArray[Any], step: Expose) -> NDArray[Any]:
+        return light + 0.05 * 65535 if step.lighting is Lighting.PATTERN else light
+
+    found = _judged(name, BLACK_WHITE, scene=_scene(change=later))
+    assert _says(found, "of the light of white", "of half the light of white")
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_black_and_white_exchanged_is_told(name: str) -> None:
+    spec = msgspec.structs.replace(METHODS[name], references=BLACK_WHITE)
+    first, frames = _taken(spec, _scene())
+    assert _says(_declared(spec, [*first[::-1], *frames]), "brighter than the white one")
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_linear_frames_declared_srgb_are_told_with_references(name: str) -> None:
+    found = _judged(name, BLACK_WHITE, radiometry=Radiometry(leakage=0.02, tone="srgb"))
+    assert _says(found, "--tone")
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_too_large_a_leakage_is_told_with_references(name: str) -> None:
+    found = _judged(name, BLACK_WHITE, radiometry=Radiometry(leakage=0.2))
+    assert _says(found, "leakage 0.2 cannot be")
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_too_high_a_black_level_is_told_and_harmless_with_references(name: str) -> None:
+    found = _judged(name, BLACK_WHITE, radiometry=Radiometry(leakage=0.02, black=6000.0))
+    assert _says(found, "black level that was given is too high")
+    assert _error(found) == pytest.approx(_error(_judged(name, BLACK_WHITE)), abs=0.002)
+
+
+@pytest.mark.parametrize("name", ALL)
+@references_or_not
+@pytest.mark.parametrize("ambient", [0.0, 0.02])
+def test_a_projector_of_gamma_2_2_is_told_or_makes_no_difference(
+    name: str, references: tuple[Reference, ...], ambient: float
+) -> None:
+    found = _judged(name, references, scene=_scene(gamma=2.2, ambient=ambient))
+    if "sinusoid" in name or "phase" in name:
+        assert _says(found, "tone curve")
+    else:  # lit and unlit alone are shown: there is nothing to bend
+        right = _judged(name, references, scene=_scene(ambient=ambient))
+        assert _error(found) == pytest.approx(_error(right), abs=0.002)
+
+
+@pytest.mark.parametrize("name", GRAY)
+def test_gray_code_in_another_order_is_told(name: str) -> None:
+    finest_first = _judged(name, NONE, lambda frames: frames[::-1])
+    assert _says(finest_first, "jump or run back")
+    inverse_first = _judged(name, NONE, lambda f: [f[n ^ 1] for n in range(len(f))])
+    assert _says(inverse_first, "jump or run back")
+
+
+def test_gray_code_without_inverses_is_told() -> None:
+    """Ten patterns of two axes declared as five bits and their inverses."""
+    spec = GrayCode(axes=BOTH, bits=6, references=NONE, radiometry=LIGHT)
+    _, frames = _taken(spec, _scene())
+    patterns = frames[::2]
+    found = _declared(GrayCode(bits=6, radiometry=LIGHT), patterns)
+    assert _says(found, "add up to light")
+
+
+def test_stripes_of_the_other_axis_are_told() -> None:
+    found = _judged("gray-code x", NONE, axes=(Axis.Y,))
+    assert _says(found, "--axes")
+    assert _error(found) < 0.02, "light does not depend on it"
+    assert _says(_judged("single-image", NONE, axis=Axis.Y), "--axis x")
+
+
+def test_two_images_of_unlike_exposure_are_told() -> None:
+    def longer(frames: Frames) -> Frames:
+        return [frames[0], np.clip(frames[1] * 1.4, 0, 65535).astype(np.uint16)]
+
+    assert _says(_judged("two-image", NONE, longer), "not a pattern and its complement")
+
+
+def test_white_darker_than_the_patterns_and_black_brighter_are_told() -> None:
+    frames = FrameSet(Response(65535), even=True)
+    method = catalog.method_for(Checkerboard(references=BLACK_WHITE), _scene().bench())
+    rng = np.random.default_rng(1)
+    for level, index in ((2000, 0), (9000, 1), (20_000, 2), (20_100, 3)):
+        step = method.step(index, {})
+        assert step is not None
+        pixels = rng.integers(level - 500, level + 500, (48, 64)).astype(np.uint16)
+        frames.add(pixels, method.observe(step, Taken(index, 0, incomplete=False)))
+    assert any("brighter than the white frame" in line for line in frames.told()[1])
