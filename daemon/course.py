@@ -204,8 +204,8 @@ class Course:
         method = self._method = prepared.method
         bench, exposure = prepared.bench, prepared.exposure
         info = bench.camera
-        exposure_us = prepared.settings.get("exposure_us", 0.0)
-        self._exposure_s = exposure_us * 1e-6
+        self._exposure_s = prepared.settings.get("exposure_us", 0.0) * 1e-6
+        choice = self._choose(bench, resuming)
         if isinstance(file.spec, PatternScan) and file.spec.bracket is not None:
             self._exposure_s *= max(file.spec.bracket)  # how long it may show no sign of life
         self._waits = None
@@ -214,12 +214,6 @@ class Course:
             rig["exposure"] = exposure.facts()
         elif resuming and (chosen := file.rig.get("exposure")):
             rig["exposure"] = chosen
-        if resuming and file.sequencing is not None:
-            self._exposed.update(file.sequencing["counts"])
-        choice = choose(file.spec, self._config.sequencer, bench, exposure_us)
-        log.info("mode", mode=choice.mode, why=choice.why)
-        for warning in choice.warnings:
-            log.warning("exposure", problem=warning)
         self._update(
             state=RunState.RUNNING,
             started=file.started or utc_now(),
@@ -268,11 +262,11 @@ class Course:
         apparatus = Apparatus(
             rig=self._rig,
             session=session,
+            control=self.control,
             method=method,
             recorder=recorder,
             ring=ring,
             patience=self._config.sequencer,
-            control=self.control,
             may_go_on=self._may_go_on,
             on_pause=self._paused,
             taken=recorder.tally.taken,
@@ -300,6 +294,28 @@ class Course:
 
     # ------------------------------------------------------------ before
 
+    def _choose(self, bench: Bench, resuming: bool) -> Choice:
+        """How exposures are kept in step with patterns. Raises Unsuitable."""
+        file = self.folder.file
+        if resuming and file.sequencing is not None:
+            self._exposed.update(file.sequencing["counts"])
+        choice = choose(file.spec, self._config.sequencer, bench, self._exposure_s * 1e6)
+        log.info("mode", mode=choice.mode, why=choice.why)
+        for warning in choice.warnings:
+            log.warning("exposure", problem=warning)
+        return choice
+
+    def _ring(self, choice: Choice, bench: Bench, planned: int | None) -> Ring:
+        """The ring: of a sequence all frames are kept until it is known to be in step, and the one
+        before is being recorded meanwhile."""
+        info, limits = bench.camera, bench.projector.sequence if bench.projector else None
+        count = self._config.sequencer.ring_frames
+        if choice.mode is Mode.HARDWARE and limits is not None:
+            frame_bytes = math.prod(info.shape) * info.pixel_format.dtype.itemsize
+            wanted = 2 * min(limits.images, planned or limits.images)
+            count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
+        return Ring(count, info.shape, info.pixel_format.dtype)
+
     def _alive(self) -> None:
         self.beat = time.monotonic()
 
@@ -321,17 +337,6 @@ class Course:
                 raise
             self.folder.remember(state=state)
             self._on_change()
-
-    def _ring(self, choice: Choice, bench: Bench, planned: int | None) -> Ring:
-        """The ring: of a sequence all frames are kept until it is known to be in step, and the one
-        before is being recorded meanwhile."""
-        info, limits = bench.camera, bench.projector.sequence if bench.projector else None
-        count = self._config.sequencer.ring_frames
-        if choice.mode is Mode.HARDWARE and limits is not None:
-            frame_bytes = math.prod(info.shape) * info.pixel_format.dtype.itemsize
-            wanted = 2 * min(limits.images, planned or limits.images)
-            count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
-        return Ring(count, info.shape, info.pixel_format.dtype)
 
     def _frames(self, info: CameraInfo, resuming: bool) -> FrameStore:
         if resuming and (self.folder.path / "frames.jsonl").exists():

@@ -123,10 +123,10 @@ class _Scale:
 class Proof:
     """Judges frame after frame of one scan; a frame that failed is forgotten, not compared with.
 
-    `full_scale`: the largest count of a pixel.
+    `full_scale` is the count of a saturated sample.
     """
 
-    def __init__(self, full_scale: float = np.inf) -> None:
+    def __init__(self, full_scale: float = math.inf) -> None:
         self._full_scale = full_scale
         self._exposures: dict[float | None, _Looks] = {}
 
@@ -134,7 +134,7 @@ class Proof:
         """A copy that goes its own way: for frames of which it is not yet known whether they
         count."""
         forked = Proof(self._full_scale)
-        forked._exposures = {length: looks.fork() for length, looks in self._exposures.items()}
+        forked._exposures = {key: looks.fork() for key, looks in self._exposures.items()}
         return forked
 
     def problem(self, pixels: NDArray[Any], step: Expose, look: Look | None) -> str:
@@ -143,7 +143,7 @@ class Proof:
         `look` is the `look_of` what the projector was given.
         """
         sample = _sample(pixels)
-        if float(np.mean(sample >= self._full_scale)) > _BLIND:
+        if _blind(sample, self._full_scale):
             return ""
         return self._exposures.setdefault(step.exposure_us, _Looks()).problem(sample, step, look)
 
@@ -200,8 +200,8 @@ class _Looks:
         if not look.even_rows:
             return ""
         off = [
-            abs((mean - black) / more - look.level) > _OFF_LEVEL if spread else None
-            for mean, black, more, spread in zip(means, scale.black, lit, scale.spread, strict=True)
+            abs((its - black) / more - look.level) > _OFF_LEVEL if spread else None
+            for its, black, more, spread in zip(means, scale.black, lit, scale.spread, strict=True)
         ]
         return _torn(off, "has not the light of its pattern")
 
@@ -246,11 +246,18 @@ class _Looks:
         self._last = (step, sample, look)
 
 
-def head_problem(white: NDArray[Any], black: NDArray[Any]) -> str:
+def head_problem(white: NDArray[Any], black: NDArray[Any], full_scale: float = math.inf) -> str:
     """Why two frames cannot be the white and the black image at the head of a sequence, or ""."""
-    if found := _of_white(_sample(white), _sample(black)):
+    first, second = _sample(white), _sample(black)
+    if _blind(second, full_scale):
+        return ""
+    if found := _of_white(first, second):
         return f"the light is not in step with the triggers: {found}"
     return ""
+
+
+def _blind(sample: Sample, full_scale: float) -> bool:
+    return float(np.mean(sample >= full_scale)) > _BLIND
 
 
 def _of_white(white: Sample, black: Sample) -> str:

@@ -38,11 +38,7 @@ def exposer_for(choice: Choice, apparatus: Apparatus) -> Exposer:
 class Sequencer:
     """One scan in its course, in the thread that calls `run`."""
 
-    def __init__(
-        self,
-        apparatus: Apparatus,
-        exposer: Exposer,
-    ) -> None:
+    def __init__(self, apparatus: Apparatus, exposer: Exposer) -> None:
         self._its = apparatus
         self._exposer = exposer
         self._video = Video(apparatus)
@@ -84,8 +80,9 @@ class Sequencer:
     def _digest(self) -> None:
         """Wait until the estimator knows every frame so far."""
         while not self._its.recorder.digested(RING_S):
-            if not self._its.checkpoint():
+            if not self._its.control.paused:
                 raise Behind
+            self._its.checkpoint()  # the disk is full
 
     def _stop(self) -> None:
         if not self._its.session.ended.is_set():

@@ -64,11 +64,11 @@ class Apparatus:
         *,
         rig: Rig,
         session: Session,
+        control: Control,
         method: Method[Any],
         recorder: Recorder,
         ring: Ring,
         patience: SequencerSection,
-        control: Control,
         may_go_on: Callable[[], None],
         on_pause: Callable[[str], None],
         taken: int,
@@ -77,18 +77,19 @@ class Apparatus:
         `taken` frames were had before."""
         self.rig = rig
         self.session = session
+        self.control = control
         self.method = method
         self.recorder = recorder
         self.ring = ring
         self.patience = patience
-        self.control = control
         self.may_go_on = may_go_on
         self._on_pause = on_pause
         self.clock = rig.clock
         self.camera = rig.camera
         self.projector = None if self.info.recorded else rig.projector
         self.lit: Lit | None = None
-        self.looks = Proof(self.info.pixel_format.full_scale) if method.looked_at else None
+        full_scale = self.info.pixel_format.full_scale
+        self.looks = Proof(full_scale) if method.looked_at else None
         self.counts: dict[str, int] = {}  # frames handed on and exposures repeated, by name
         calibration = method.bench.calibration or {}
         self._latency_ns = round(float(calibration.get("latency_s", 0.0)) * NS)
@@ -102,11 +103,11 @@ class Apparatus:
     # ------------------------------------------------------------ pauses
 
     def checkpoint(self) -> bool:
-        """Stay here for as long as the run is paused, dark and held; whether it was. Then the light
-        is nobody's, and the camera acquires nothing. Raises Revoked."""
-        return self.control.checkpoint(self.session, self._hold)
+        """Stay here while paused, dark and held; True if there was a pause: then nothing is lit and
+        the camera is stopped. Nothing may be under way. Raises Revoked."""
+        return self.control.checkpoint(self.session, self._paused)
 
-    def _hold(self, reason: str) -> None:
+    def _paused(self, reason: str) -> None:
         self.stop()
         self.lit = None
         if self.projector is not None:
@@ -177,12 +178,15 @@ class Apparatus:
         self.camera.call(lambda c: c.configure(wanted), CALL_S, self.session)
 
     def buffer(self) -> Buffer:
-        """A free buffer; while the disk is full none comes free, and the run is paused. Raises
-        Behind, or what went wrong in the recorder."""
+        """A free buffer; there may have been a pause, for a disk that is full.
+
+        Raises Behind, or what went wrong in the recorder.
+        """
         while (buffer := self.ring.take(RING_S)) is None:
             self.recorder.check()
-            if not self.checkpoint():
+            if not self.control.paused:
                 raise Behind
+            self.checkpoint()
         return buffer
 
     # ------------------------------------------------------------ light

@@ -107,8 +107,8 @@ class Sequences(Exposer):
         at = (index, first)
         shots = self._ahead[1] if self._ahead and self._ahead[0] == at else self._gather(*at)
         self._ahead = None
-        if not shots:
-            return self._alone(index, step, first)
+        if not shots or (len(shots) <= GUARDS and self._single is not None):
+            return self._alone(index, step, first)  # a sequence would be more guards than frames
         self.settle()
         self._its.set_exposure(step.exposure_us)
         try:
@@ -202,13 +202,16 @@ class Sequences(Exposer):
 
     def _sequence(self, shots: list[_Shot]) -> tuple[int, int]:
         its = self._its
-        buffers = [its.buffer() for _ in shots]
-        its.acquire(Acquisition.HARDWARE)
         guards = self._guards()
-        loaded = self._load([*guards, *shots])
         shape, dtype = its.info.shape, its.info.pixel_format.dtype
         scratch = [np.empty(shape, dtype) for _ in guards]
+        buffers: list[Buffer] = []
         try:
+            while len(buffers) < len(shots):
+                buffers.append(its.buffer())
+            its.lit = None
+            its.acquire(Acquisition.HARDWARE)
+            loaded = self._load([*guards, *shots])
             for attempt in range(1, its.patience.attempts + 1):
                 its.may_go_on()
                 found, problem = self._attempt(
@@ -326,9 +329,18 @@ class Sequences(Exposer):
             so_far = replace(loaded, images=len(frames))
             if problem := mismatch(so_far, frames, began_ns):
                 return problem
-            if problem := _of_looks(frames, shot, judges):
+            if problem := self._of_looks(frames, shot, judges):
                 return f"frame {len(frames) - 1} of the sequence: {problem}"
         return ""
+
+    def _of_looks(self, frames: Sequence[Frame], shot: _Shot, judges: Proof | None) -> str:
+        """Why the last of the frames does not look like what was shown for it; "" if it does."""
+        if len(frames) == GUARDS:
+            white, black = (frame.pixels for frame in frames)
+            return head_problem(white, black, self._its.info.pixel_format.full_scale)
+        if len(frames) < GUARDS or judges is None:
+            return ""
+        return judges.problem(frames[-1].pixels, shot.step, shot.drawing.look)
 
     def _one_more(self, grab: Future[Frame], wait_s: float, frames: list[Frame]) -> str:
         """After the last frame none may come."""
@@ -348,7 +360,7 @@ class Sequences(Exposer):
         its.may_go_on()
         due = time.monotonic() + wait_s + CALL_S
         while not grab.done() and time.monotonic() < due:
-            if self._its.control.paused:
+            if its.control.paused:
                 raise _CalledOff
             wait_for([grab], _LOOK_S)
         return its.camera.wait(grab, 0.0)
@@ -377,13 +389,3 @@ class Sequences(Exposer):
             "check the cable from the projector's trigger output, and trigger_line and "
             "trigger_edge in rig.toml; or take mode software",
         )
-
-
-def _of_looks(frames: Sequence[Frame], shot: _Shot, judges: Proof | None) -> str:
-    """Why the last of the frames does not look like what was shown for it; "" if it does."""
-    if len(frames) == GUARDS:
-        white, black = (frame.pixels for frame in frames)
-        return head_problem(white, black)
-    if len(frames) < GUARDS or judges is None:
-        return ""
-    return judges.problem(frames[-1].pixels, shot.step, shot.drawing.look)

@@ -2,10 +2,12 @@
 
 For a pattern step the light is first this pattern's (`show` returns at that moment), then the
 camera is triggered; the next pattern is drawn while the exposure lasts and flipped as soon as it
-ends, so that readout and flip go on side by side (for the exposures of a bracket the light stays):
+ends, so that readout and flip go on side by side:
 
     projector   |flip k|..........|flip k+1|..........
     camera             |expose k| readout k |expose k+1|
+
+For the exposures of a bracket the light stays.
 
 A frame counts only if its exposure lies wholly within the time in which its pattern was lit, by
 the device's own time stamps, and if it looks like its pattern (`daemon.proof`). Repeating is safe
@@ -16,7 +18,7 @@ camera that needs no light.
 from __future__ import annotations
 
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import structlog
 
@@ -58,23 +60,19 @@ class Stepped(Exposer):
     def expose(self, index: int, step: Expose, first: int) -> tuple[int, int]:
         """See Exposer."""
         its = self._its
-        if first >= step.frames:
-            return index + 1, 0
-        if its.needs_exposure(step.exposure_us):
-            self.settle()  # what is being read out was exposed as before
-            its.set_exposure(step.exposure_us)
-        its.acquire(Acquisition.SOFTWARE)
-        lit = its.lit
-        if lit is None or not _next_of_bracket(lit.step, step):
-            lit = self._light(step)
+        if first < step.frames:
+            if its.needs_exposure(step.exposure_us):
+                self.settle()  # what is being read out was exposed as before
+                its.set_exposure(step.exposure_us)
+            if its.lit is not None and _next_of_bracket(its.lit.step, step):
+                its.lit = replace(its.lit, step=step)  # the light is this step's already
+            else:
+                its.acquire(Acquisition.SOFTWARE)
+                self._light(step)
         for sub in range(first, step.frames):
             self.settle()
-            its.checkpoint()  # frames of a long step would fill the ring while the disk is full
-            buffer = its.buffer()
-            if its.lit is not lit:  # after a pause; or settling had to show an earlier pattern
-                its.acquire(Acquisition.SOFTWARE)
-                lit = self._light(step)
-            self._pending = self._trigger(index, step, sub, lit, buffer, attempt=1)
+            its.checkpoint()  # the frames of a long step would fill the ring while the disk is full
+            self._pending = self._trigger(index, step, sub, attempt=1)
             if sub + 1 == step.frames:
                 its.draw_ahead(index + 1)
             self._await_exposure(self._pending)
@@ -85,10 +83,13 @@ class Stepped(Exposer):
             self._pending.dark_ns = self._its.clock.now_ns()
         return self._its.light(step)
 
-    def _trigger(
-        self, index: int, step: Expose, sub: int, lit: Lit, buffer: Buffer, attempt: int
-    ) -> _Exposure:
+    def _trigger(self, index: int, step: Expose, sub: int, attempt: int) -> _Exposure:
         its = self._its
+        buffer = its.buffer()
+        its.acquire(Acquisition.SOFTWARE)
+        lit = its.lit
+        if lit is None or lit.step is not step:  # an earlier pattern was shown again, or a pause
+            lit = self._light(step)
         if its.projector is not None:
             its.clock.wait_until(lit.from_ns + round(step.delay_s * NS), its.session.ended)
             its.session.check()
@@ -128,6 +129,7 @@ class Stepped(Exposer):
             its.ring.give(exposure.buffer)
             # After a doubtful frame nothing in the camera's queue can be trusted: empty it.
             its.stop()
+            its.acquire(Acquisition.SOFTWARE)
             if exposure.attempt < its.patience.attempts:
                 its.count("repeated")
                 log.warning(
@@ -137,13 +139,10 @@ class Stepped(Exposer):
                     attempt=exposure.attempt,
                     problem=problem,
                 )
-                buffer = its.buffer()
-                its.acquire(Acquisition.SOFTWARE)
-                lit = self._light(step)
-                self._pending = self._trigger(index, step, sub, lit, buffer, exposure.attempt + 1)
+                self._light(step)
+                self._pending = self._trigger(index, step, sub, exposure.attempt + 1)
                 self._await_exposure(self._pending)
             else:
-                its.acquire(Acquisition.SOFTWARE)
                 its.miss(index, step, sub, problem)
 
     def _proof(self, exposure: _Exposure, frame: Frame) -> str:

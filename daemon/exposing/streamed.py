@@ -50,9 +50,9 @@ class Streamed(Exposer):
         for sub in range(first, step.frames):
             for attempt in range(1, its.patience.attempts + 1):
                 its.may_go_on()
-                its.checkpoint()
+                its.checkpoint()  # the frames of a long step would fill the ring and the disk
                 buffer = its.buffer()
-                if its.lit is not lit:  # after a pause
+                if its.lit is not lit:
                     lit = self._light(step)
                 frame, problem = self._take(buffer, step, lit)
                 if frame is not None and not problem:

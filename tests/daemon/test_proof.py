@@ -100,38 +100,6 @@ def test_a_coarse_pattern_says_nothing_of_the_level() -> None:
             assert judged(proof, scene, asked) == ""
 
 
-FULL = 4095
-EXPOSURES = (None, 20_000.0, 80_000.0)
-
-
-def bracketed(
-    proof: Proof, scene: Scene, factor: float, asked: Expose, shown: AnyPattern | None = None
-) -> str:
-    assert asked.pattern is not None
-    light = scene.frame(shown or asked.pattern).astype(np.float64) * factor
-    counts: Pixels = np.minimum(light, FULL).astype(np.uint16)
-    return proof.problem(counts, asked, look_of(render(asked.pattern, W, H)))
-
-
-@pytest.mark.parametrize("longest", [4.0, 64.0])  # half of the scene is saturated; all of it
-def test_exposures_of_a_bracket_are_judged_each_for_itself(longest: float) -> None:
-    scene, proof = Scene(), Proof(FULL)
-    factors = dict(zip(EXPOSURES, (1.0, 2.0, longest), strict=True))
-    shown: list[tuple[AnyPattern, Lighting]] = [(BLACK, Lighting.BLACK), (WHITE, Lighting.WHITE)]
-    shown += [(pattern, Lighting.PATTERN) for pattern in SHIFTS[:5]]
-    for turn, (pattern, lighting) in enumerate(shown):
-        order = EXPOSURES if turn % 2 == 0 else EXPOSURES[::-1]
-        for exposure in order:
-            asked = Expose(pattern, lighting, exposure_us=exposure)
-            assert bracketed(proof, scene, factors[exposure], asked) == ""
-    for exposure in EXPOSURES[:2]:
-        asked = Expose(SHIFTS[5], exposure_us=exposure)
-        before = bracketed(proof, scene, factors[exposure], asked, shown=SHIFTS[4])
-        assert "the pattern before" in before
-        black = bracketed(proof, scene, factors[exposure], asked, shown=BLACK)
-        assert "another image was shown" in black
-
-
 class Torn(Scene):
     """Rows from `row` on, or up to it, are of another image."""
 
@@ -211,3 +179,35 @@ def test_the_head_of_a_sequence(first: AnyPattern | None, second: AnyPattern, la
     dark = (scene.rng.normal(AMBIENT, SIGMA, (H, W))).astype(np.uint16)
     white = dark if first is None else scene.frame(first)
     assert ("not in step" in head_problem(white, scene.frame(second))) is late
+
+
+FULL = 4095
+EXPOSURES = (None, 20_000.0, 80_000.0)
+
+
+def bracketed(
+    proof: Proof, scene: Scene, factor: float, asked: Expose, shown: AnyPattern | None = None
+) -> str:
+    assert asked.pattern is not None
+    light = scene.frame(shown or asked.pattern).astype(np.float64) * factor
+    counts: Pixels = np.minimum(light, FULL).astype(np.uint16)
+    return proof.problem(counts, asked, look_of(render(asked.pattern, W, H)))
+
+
+@pytest.mark.parametrize("longest", [4.0, 64.0])  # half of the scene is saturated; all of it
+def test_exposures_of_a_bracket_are_judged_each_for_itself(longest: float) -> None:
+    scene, proof = Scene(), Proof(FULL)
+    factors = dict(zip(EXPOSURES, (1.0, 2.0, longest), strict=True))
+    shown: list[tuple[AnyPattern, Lighting]] = [(BLACK, Lighting.BLACK), (WHITE, Lighting.WHITE)]
+    shown += [(pattern, Lighting.PATTERN) for pattern in SHIFTS[:5]]
+    for turn, (pattern, lighting) in enumerate(shown):
+        order = EXPOSURES if turn % 2 == 0 else EXPOSURES[::-1]
+        for exposure in order:
+            asked = Expose(pattern, lighting, exposure_us=exposure)
+            assert bracketed(proof, scene, factors[exposure], asked) == ""
+    for exposure in EXPOSURES[:2]:
+        asked = Expose(SHIFTS[5], exposure_us=exposure)
+        before = bracketed(proof, scene, factors[exposure], asked, shown=SHIFTS[4])
+        assert "the pattern before" in before
+        black = bracketed(proof, scene, factors[exposure], asked, shown=BLACK)
+        assert "another image was shown" in black
