@@ -160,7 +160,7 @@ class StreamingCamera(Camera):
         try:
             with self._errors("connect"):
                 self._identity = self._open()
-                self._apply(_merged(stated, self._wanted), "connect")
+                self._apply(merged(stated, self._wanted), "connect")
                 self._info, self._settings = self._read()
         except BaseException:
             self.close()
@@ -212,7 +212,7 @@ class StreamingCamera(Camera):
         with self._errors("configure"):
             self._apply(wanted, "configure")
             self._info, self._settings = self._read()
-        self._wanted = _merged(self._wanted, wanted)
+        self._wanted = merged(self._wanted, wanted)
         return self._settings
 
     # ------------------------------------------------------------ acquisition
@@ -387,6 +387,7 @@ class StreamingCamera(Camera):
         return DeviceRefused(self.name, phase, problem, remedy)
 
 
-def _merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:
+def merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:
+    """The settings of `over`, and where it has none those of `under`."""
     given = {f.name: getattr(over, f.name) for f in fields(over)}
     return replace(under, **{name: v for name, v in given.items() if v is not None})
