@@ -161,7 +161,7 @@ class StreamingCamera(Camera):
         try:
             with self._errors("connect"):
                 self._identity = self._open()
-                self._apply(_merged(stated, self._wanted), "connect")
+                self._apply(merged(stated, self._wanted), "connect")
                 self._take_in()
         except BaseException:
             self.close()
@@ -213,7 +213,7 @@ class StreamingCamera(Camera):
         with self._errors("configure"):
             self._apply(wanted, "configure")
             self._take_in()
-        self._wanted = _merged(self._wanted, wanted)
+        self._wanted = merged(self._wanted, wanted)
         return self._settings
 
     def _take_in(self) -> None:
@@ -393,6 +393,7 @@ class StreamingCamera(Camera):
         return DeviceRefused(self.name, phase, problem, remedy)
 
 
-def _merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:
+def merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:
+    """The settings of `over`, and where it has none those of `under`."""
     given = {f.name: getattr(over, f.name) for f in fields(over)}
     return replace(under, **{name: v for name, v in given.items() if v is not None})
