@@ -58,6 +58,8 @@ def test_drift_and_clouds_change_nothing_beyond_the_noise() -> None:
     cloudy = under("cloudy", 3)
     rejected = cloudy.components.facts["rejected"]
     assert rejected["cloud"] > 20
+    assert steady.components.facts["penumbra_mm"] == pytest.approx(1.4, abs=0.2)
+    assert steady.components.facts["leakage_at_most"] == 0.0
     noise, found = apart(steady, under("steady", 2)), apart(steady, cloudy)
     assert rms(found[0]) < 1.2 * rms(noise[0])
     assert rms(found[1]) < 1.3 * rms(noise[1])
