@@ -37,7 +37,8 @@ def under(weather: str, seed: int) -> Outdoors:
         sun = {**SUN, "clouds": CLOUDS}
     if weather == "rough":
         camera["gusts"] = GUSTS
-    return scan(SPEC, stage=STAGE, sun=sun, camera=camera, frames=140 if weather == "steady" else 170)
+    frames = 140 if weather == "steady" else 170
+    return scan(SPEC, stage=STAGE, sun=sun, camera=camera, frames=frames)
 
 
 def apart(one: Outdoors, other: Outdoors) -> NDArray[np.float64]:
