@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -72,6 +72,9 @@ class SequencerSection(_Section, frozen=True, kw_only=True):
     attempts: Annotated[int, Meta(ge=1, le=100)] = 3  # exposures of a frame before it is missing
     ring_frames: Annotated[int, Meta(ge=2, le=4096)] = 16  # frames between camera and disk
     frame_timeout_s: Annotated[float, Meta(gt=0)] = 2.0  # beyond exposure and readout
+    mode: Literal["auto", "hardware", "software", "free"] = "auto"  # see daemon.exposing.modes
+    trigger_wired: bool = False  # the projector's trigger output goes to the camera's input
+    period_us: Annotated[float, Meta(gt=0)] | None = None  # of a hardware-timed sequence
 
 
 class CalibrationSection(_Section, frozen=True, kw_only=True):

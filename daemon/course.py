@@ -9,8 +9,9 @@ a failure keeps what was recorded, an abort leaves the devices safe, a full disk
 
 from __future__ import annotations
 
+import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -23,15 +24,18 @@ from daemon.config import RigConfig
 from daemon.control import Control
 from daemon.devicethread import Revoked, Session
 from daemon.durable import StorageError
+from daemon.exposing.apparatus import Apparatus
+from daemon.exposing.exposer import Behind
+from daemon.exposing.modes import Choice, Mode, choose
 from daemon.failures import as_error
 from daemon.frames import FrameStore
 from daemon.preparation import Preparation
 from daemon.recorder import Exposed, Recorder, Tally
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Ring
-from daemon.scans.method import Method
+from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet, Result
-from daemon.sequencer import Behind, Sequencer
+from daemon.sequencer import Sequencer, exposer_for
 from daemon.store import RunFolder, Store
 from daemon.viewfinder import Viewfinder
 from drivers.base import CameraInfo, DeviceError
@@ -47,6 +51,8 @@ _RESULT_S = 30.0
 TRUTH_S = 60.0
 _CONCLUDE_S = 600.0
 SUN_DEG_PER_HOUR = 15.0
+_SEQUENCE_BYTES = 256 << 20
+"""Memory for the frames of hardware-timed sequences, where `ring_frames` are fewer."""
 _STILL_S = 60.0
 """A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
 
@@ -88,6 +94,7 @@ class Course:
         self._room_seen = 0.0
         self._timings: dict[str, float] = {}
         self._exposure_s = 0.0
+        self._exposed: Counter[str] = Counter()  # see `Choice.facts`
         self._reason = ""  # why the steps ended
         self._broke_off = ""  # when an interrupted run took its last frame
         self._waits: Waiting | None = None
@@ -195,8 +202,10 @@ class Course:
         self._broke_off = self._last_frame() if resuming else ""
         prepared = preparation.prepare(session, resuming=resuming)
         method = self._method = prepared.method
-        info, exposure = prepared.bench.camera, prepared.exposure
+        bench, exposure = prepared.bench, prepared.exposure
+        info = bench.camera
         self._exposure_s = prepared.settings.get("exposure_us", 0.0) * 1e-6
+        choice = self._choose(bench, resuming)
         if isinstance(file.spec, PatternScan) and file.spec.bracket is not None:
             self._exposure_s *= max(file.spec.bracket)  # how long it may show no sign of life
         self._waits = None
@@ -212,14 +221,15 @@ class Course:
             end=None,
             planned=method.planned(),
             rig=rig,
-            bench=prepared.bench.recorded(),
+            bench=bench.recorded(),
             calibration=prepared.calibration,
+            sequencing=choice.facts(self._exposed),
         )
         if prepared.waited_s:
             self._timings["waited_s"] = prepared.waited_s
         frames = self._frames(info, resuming)
         try:
-            ring = Ring(self._config.sequencer.ring_frames, info.shape, info.pixel_format.dtype)
+            ring = self._ring(choice, bench, method.planned())
             recorder = self._recorder = Recorder(method, frames, ring, self._taken, self._disk_full)
             step, sub = self._replay(session, recorder, resuming)
             recorder.start()
@@ -227,13 +237,13 @@ class Course:
             self._timings["prepare_s"] = time.monotonic() - began
             scanning = self._rig.clock.now_ns()
             try:
-                self._sequence(session, method, recorder, ring, (step, sub))
+                self._sequence(session, method, recorder, ring, choice, (step, sub))
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.
                 try:
                     recorder.finish()
                 finally:
-                    self._count(recorder.tally)
+                    self._count(recorder.tally, choice)
             self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
             truth = self._truth(session)
             self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
@@ -247,21 +257,24 @@ class Course:
         method: Method[Any],
         recorder: Recorder,
         ring: Ring,
+        choice: Choice,
         start: tuple[int, int],
     ) -> None:
+        apparatus = Apparatus(
+            rig=self._rig,
+            session=session,
+            control=self.control,
+            method=method,
+            recorder=recorder,
+            ring=ring,
+            patience=self._config.sequencer,
+            may_go_on=self._may_go_on,
+            on_pause=self._paused,
+            taken=recorder.tally.taken,
+        )
+        sequencer = Sequencer(apparatus, exposer_for(choice, apparatus))
         try:
-            sequencer = Sequencer(
-                rig=self._rig,
-                session=session,
-                control=self.control,
-                method=method,
-                recorder=recorder,
-                ring=ring,
-                patience=self._config.sequencer,
-                may_go_on=self._may_go_on,
-                on_pause=self._paused,
-            )
-            sequencer.run(*start, taken=recorder.tally.taken)
+            sequencer.run(*start)
             self._reason = sequencer.reason
         except Behind as error:
             raise UmbraError(
@@ -269,6 +282,8 @@ class Course:
                 f"{self._config.rig.data}: the disk has not taken a frame for half a minute; "
                 "check it, then `umbra resume`",
             ) from error
+        finally:
+            self._exposed.update(apparatus.counts)
 
     def _truth(self, session: Session) -> dict[str, Any]:
         """What a simulated camera knows; a scan does not fail for the lack of it."""
@@ -279,6 +294,28 @@ class Course:
             return {}
 
     # ------------------------------------------------------------ before
+
+    def _choose(self, bench: Bench, resuming: bool) -> Choice:
+        """How exposures are kept in step with patterns. Raises Unsuitable."""
+        file = self.folder.file
+        if resuming and file.sequencing is not None:
+            self._exposed.update(file.sequencing["counts"])
+        choice = choose(file.spec, self._config.sequencer, bench, self._exposure_s * 1e6)
+        log.info("mode", mode=choice.mode, why=choice.why)
+        for warning in choice.warnings:
+            log.warning("exposure", problem=warning)
+        return choice
+
+    def _ring(self, choice: Choice, bench: Bench, planned: int | None) -> Ring:
+        """The ring: of a sequence all frames are kept until it is known to be in step, and the one
+        before is being recorded meanwhile."""
+        info, limits = bench.camera, bench.projector.sequence if bench.projector else None
+        count = self._config.sequencer.ring_frames
+        if choice.mode is Mode.HARDWARE and limits is not None:
+            frame_bytes = math.prod(info.shape) * info.pixel_format.dtype.itemsize
+            wanted = 2 * min(limits.images, planned or limits.images)
+            count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
+        return Ring(count, info.shape, info.pixel_format.dtype)
 
     def _alive(self) -> None:
         self.beat = time.monotonic()
@@ -423,8 +460,13 @@ class Course:
         self.folder.update(**changes)
         self._on_change()
 
-    def _count(self, tally: Tally) -> None:
-        self.folder.update(recorded=tally.recorded, missing=tally.missing, rejected=tally.rejected)
+    def _count(self, tally: Tally, choice: Choice) -> None:
+        self.folder.update(
+            recorded=tally.recorded,
+            missing=tally.missing,
+            rejected=tally.rejected,
+            sequencing=choice.facts(self._exposed),
+        )
 
     # ------------------------------------------------------------ after
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import structlog
 
 from daemon.devicethread import Session
+from daemon.exposing.apparatus import CALL_S, SHOW_S
 from daemon.lightmeter import LONGEST_US, limits_of
 from daemon.live import Live
 from daemon.manualstage import ManualStage
@@ -26,7 +27,6 @@ from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench
 from daemon.scans.single_image import SingleImageMethod
 from daemon.separation.radiometry import Response
-from daemon.sequencer import CALL_S, SHOW_S
 from daemon.snapshot import snap
 from daemon.viewfinder import Viewfinder
 from drivers.base import Camera, CameraInfo, CameraSettings, DeviceError, Frame

@@ -99,7 +99,7 @@ def render(
         files=report.files(products),
         rig=report.table(report.flat(file.rig)),
         versions=report.table(file.versions.items()),
-        settings=report.table(report.asked(file)),
+        settings=report.table([*report.asked(file), *report.in_step(file)]),
     )
     return report.page(file, figures, body, "Every point of the plots is in the CSV files.")
 

@@ -19,6 +19,7 @@ from daemon.calibration import Calibrations
 from daemon.config import RigConfig
 from daemon.control import Control
 from daemon.devicethread import Session
+from daemon.exposing.apparatus import CALL_S
 from daemon.lightmeter import LightMeter, require_meterable
 from daemon.metering import Exposure, Level
 from daemon.motion import require_homed
@@ -27,7 +28,6 @@ from daemon.rig import Rig
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Method
 from daemon.scans.pattern_scan import response_of
-from daemon.sequencer import CALL_S
 from daemon.store import RunFolder, Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
 from drivers.base import CameraSettings, DeviceError

@@ -124,6 +124,7 @@ def advice(subject: Subject) -> list[str]:
             f"The scene uses {_percent(top)} of the camera's scale: "
             f"an exposure about {0.8 / top:.0f} times as long would lower the noise."
         )
+    lines += (file.sequencing or {}).get("warnings", [])
     lines += calibration_advice(file)
     return lines or ["Nothing to mend: well exposed, all frames taken, few pixels flagged."]
 
@@ -292,11 +293,21 @@ def _settings(subject: Subject) -> Iterable[tuple[str, Any]]:
     for key in ("estimator", "lit_fraction", "leakage", "black_level", "tone", "full_scale"):
         if key in subject.facts:
             yield key, subject.facts[key]
+    yield from in_step(subject.file)
     known = {"method", "note", "exposure_us", "gain", "lit_fraction", "estimator", "radiometry"}
+    known.add("mode")
     for key, value in spec.items():
         if key not in known and value is not None:
             yield key, value
     yield "pictures show as white", f"{subject.white:.4g} counts"
+
+
+def in_step(file: RunFile) -> Iterable[tuple[str, Any]]:
+    """How exposures were kept in step with patterns."""
+    if file.sequencing is not None:
+        yield "mode", f"{file.sequencing['mode']}: {file.sequencing['why']}"
+        for name, count in file.sequencing["counts"].items():
+            yield f"exposures {name}", count
 
 
 def asked(file: RunFile) -> Iterable[tuple[str, Any]]:

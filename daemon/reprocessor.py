@@ -143,6 +143,7 @@ class Reprocessor:
             "parents": tuple(dict.fromkeys((parent.id, source.id))),
             "planned": source.file.planned,
             "bench": source.file.bench,
+            "sequencing": source.file.sequencing,
             "calibration": self._calibration(parent, now=asked.calibration == "now"),
         }
         tried = RunFile(id="", state=RunState.QUEUED, spec=spec, submitted="", **fields)

@@ -15,6 +15,7 @@ import structlog
 from daemon import aftermath
 from daemon.config import RigConfig
 from daemon.course import Course, utc_now
+from daemon.exposing.modes import choose
 from daemon.failures import as_error
 from daemon.frames import count
 from daemon.lightmeter import require_meterable
@@ -303,6 +304,8 @@ class Runner:
                 bench = self._rig.bench()
                 method_for(spec, bench)
                 require_meterable(spec, bench)
+                exposure_us = spec.exposure_us or bench.exposure_us or 0.0
+                choose(spec, self._config.sequencer, bench, exposure_us)
             except Unsuitable as error:
                 raise as_error(error) from error
         run = self._store.create(

@@ -73,6 +73,7 @@ class RunFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     rig: dict[str, Any] = {}
     bench: dict[str, Any] | None = None
     calibration: dict[str, Any] | None = None
+    sequencing: dict[str, Any] | None = None
     versions: dict[str, str] = {}
     timings: dict[str, float] = {}
     estimates: dict[str, float] = {}

@@ -204,6 +204,7 @@ class CameraInfo:
     gain_unit: str = ""  # "dB", "ISO"; "": the device's own
     max_rate_hz: float = 0.0  # frames a second at the present exposure; 0: unknown
     readout_s: float = 0.0  # from the end of the exposure to the frame being here
+    rolling_s: float = 0.0  # how much later the last row is exposed than the first; 0: all at once
     triggers: tuple[str, ...] = ("software",)  # software, hardware, none (free-running only)
     recorded: bool = False  # frames were taken before: no projector is needed to get them
     frame_count: int | None = None  # of a recording, if it is known
@@ -239,8 +240,9 @@ class Frame:
     """One exposure as the driver knows it; never modified after it leaves the driver.
 
     `pixels` (H, W) or (H, W, 3) RGB, uint8 or uint16, C order. `start_ns`/`end_ns` bound the
-    exposure on the rig's monotonic clock. `sequence` is the device's own count: a gap is a loss.
-    `incomplete` says that parts are missing (lost packets): such a frame is never used.
+    exposure (of a rolling shutter: of the first row) on the rig's monotonic clock. `sequence` is
+    the device's own count: a gap is a loss. `incomplete` says that parts are missing (lost
+    packets): such a frame is never used.
     """
 
     pixels: NDArray[Any]
@@ -318,6 +320,7 @@ class SequenceLimits:
     bits: int  # 1: black and white only; 8: grey levels
     period_us: tuple[float, float]  # the shortest and the longest from one image to the next
     dark_us: float = 0.0  # at least this, where an image is lit for less than its period
+    total_us: float = 0.0  # all images together at most; 0: any
 
 
 @dataclass(frozen=True, slots=True)

@@ -158,6 +158,7 @@ class Dlpc350Projector(Projector):
         self._dark("stop")
 
     def _dark(self, phase: str) -> None:
+        self._halted.clear()  # what was halted has ended; this must not end with it
         try:
             self._write(Command.LEDS, p.LEDS_OFF, phase)  # first: it is dark from here on
             self._showing = None
@@ -212,16 +213,17 @@ class Dlpc350Projector(Projector):
         square = self._o.layout == "square"
         if self._screen is None:
             latency, most = self._o.flash_load_ms / 1e3, p.ENTRIES
-            longest = float(p.LONGEST_US)
+            longest, total = float(p.LONGEST_US), 0.0
         else:
             latency = self._screen.info().latency_s + VIDEO_LATENCY_FRAMES / self._refresh_hz
             most, longest = dmd.PLANES, float(self._frame_us)
+            total = longest  # one video frame holds them all
         return ProjectorInfo(
             2 * dmd.COLUMNS if square else dmd.COLUMNS,
             dmd.ROWS,
             self._refresh_hz,
             latency,
-            SequenceLimits(most, 1, (float(p.SHORTEST_US[1]), longest), float(p.DARK_US)),
+            SequenceLimits(most, 1, (float(p.SHORTEST_US[1]), longest), float(p.DARK_US), total),
         )
 
     @property

@@ -17,7 +17,6 @@ import contextlib
 import threading
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import gphoto2 as gp
@@ -44,6 +43,7 @@ from drivers.clock import NS
 from drivers.gphoto2config import Config
 from drivers.imagefile import BadImage
 from drivers.rawfile import develop
+from drivers.streaming import merged
 
 SHUTTER = ("shutterspeed", "shutterspeed2", "exptime")  # what makers call it
 ISO = ("iso", "isospeed")
@@ -113,7 +113,7 @@ class GphotoCamera(Camera):
                 for name, value in mine.config.items():
                     self._choose(name, value, "connect")
                 stated = CameraSettings(exposure_us=mine.exposure_us, gain=mine.iso)
-                self._apply(_merged(stated, self._wanted), "connect")
+                self._apply(merged(stated, self._wanted), "connect")
                 self._learn("connect")
         except BaseException:
             self.close()
@@ -191,7 +191,7 @@ class GphotoCamera(Camera):
             raise self._refused("configure", "it is acquiring", "stop it first")
         with self._errors("configure"):
             self._apply(wanted, "configure")
-        self._wanted = _merged(self._wanted, wanted)
+        self._wanted = merged(self._wanted, wanted)
         self._settings = self._in_force()
         return self._settings
 
@@ -465,8 +465,3 @@ def _opened(model: str, port: str) -> Any:
     camera.set_abilities(kinds[kinds.lookup_model(model)])
     camera.init()
     return camera
-
-
-def _merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:
-    given = {name: getattr(over, name) for name in CameraSettings.__dataclass_fields__}
-    return replace(under, **{name: v for name, v in given.items() if v is not None})

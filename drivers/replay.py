@@ -20,13 +20,12 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import imagefile
+from drivers import imagefile, videofile
 from drivers.base import (
     Acquisition,
     Camera,
@@ -46,10 +45,10 @@ from drivers.base import (
 )
 from drivers.clock import NS
 from drivers.imagefile import BadImage, ImageHeader
+from drivers.videofile import VideoFile
 
 T = TypeVar("T")
 
-DEFAULT_RATE_HZ = 30.0
 DROPPINGS = frozenset({"thumbs.db", "ehthumbs.db", "desktop.ini"})  # and all that begins with "."
 
 
@@ -88,58 +87,6 @@ class _Recording:
         return len(self.images) + self.video_frames
 
 
-class _Video:
-    """A video file, read from its beginning; frames (H, W, 3) uint8 RGB as stored, unrotated."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.next = 0
-        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        if not self._capture.isOpened():
-            raise BadImage("is not a video that can be read", "convert it, or name its folder")
-
-    @property
-    def rate_hz(self) -> float:
-        rate = float(self._capture.get(cv2.CAP_PROP_FPS))
-        return rate if 0 < rate < 1e6 else DEFAULT_RATE_HZ
-
-    def count(self) -> int:
-        """Frames that really decode: as the header says if its last one does, else counted."""
-        said = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if said > 0 and self._capture.set(cv2.CAP_PROP_POS_FRAMES, said - 1):
-            there = self._capture.grab()
-            if there and self._capture.get(cv2.CAP_PROP_POS_FRAMES) == said:
-                return said
-        self._rewind()
-        while self._capture.grab():
-            self.next += 1
-        return self.next
-
-    def skip(self, frames: int) -> None:
-        for _ in range(frames):
-            if not self._capture.grab():
-                return
-            self.next += 1
-
-    def read(self) -> NDArray[np.uint8] | None:
-        """The next frame; None at the end."""
-        there, image = self._capture.read()
-        if not there:
-            return None
-        self.next += 1
-        return cast(NDArray[np.uint8], cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-
-    def close(self) -> None:
-        self._capture.release()
-
-    def _rewind(self) -> None:
-        self._capture.release()
-        self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        self.next = 0
-
-
 _Read = tuple[NDArray[Any] | None, str]  # pixels (None: the end), the name of their source
 
 
@@ -157,7 +104,7 @@ class ReplayCamera(Camera):
         self._info: CameraInfo | None = None
         self._reader: ThreadPoolExecutor | None = None
         self._ahead: Future[_Read] | None = None
-        self._video: _Video | None = None
+        self._video: VideoFile | None = None
         self._next = 0
         self._origin_ns = 0
         self._utc_minus_now = 0
@@ -175,9 +122,12 @@ class ReplayCamera(Camera):
         video = None if root.is_dir() else root
         images = first if video else first + self._listing(root, first)
         headers = {path: self._at(path, "connect", imagefile.inspect) for path in images}
-        frames, rate = 0, DEFAULT_RATE_HZ
+        frames, rate = 0, videofile.DEFAULT_RATE_HZ
         if video:
-            headers[video], frames, rate = self._at(video, "connect", self._inspect_video)
+            grey = bool(self.options.bayer)  # a mosaic is stored as grey video
+            headers[video], frames, rate = self._at(
+                video, "connect", lambda path: videofile.inspect(path, grey=grey)
+            )
         layout = self._same_layout(headers)
         recording = _Recording(images, video, frames, layout, self.options.rate_hz or rate)
         self._info = self._describe(recording)
@@ -341,29 +291,6 @@ class ReplayCamera(Camera):
             )
         return files
 
-    def _inspect_video(self, path: Path) -> tuple[ImageHeader, int, float]:
-        try:
-            if imagefile.is_image(path):
-                raise BadImage("is one image, not a video", "give its folder")
-            with path.open("rb") as file:
-                head = file.read(4096)
-        except OSError as error:
-            raise BadImage(f"cannot be read ({error.strerror})", "check its permissions") from error
-        if b"\0" not in head and not head.startswith(b"YUV4MPEG2"):
-            # FFmpeg plays text files as terminal art.
-            raise BadImage("is neither a folder nor a video", "give a folder or a video file")
-        video = _Video(path)
-        try:
-            image = video.read()
-            frames = video.count()
-            rate = video.rate_hz
-        finally:
-            video.close()
-        if image is None or not frames:
-            raise BadImage("has no frames", "copy or convert it again")
-        grey = bool(self.options.bayer)  # a mosaic is stored as grey video
-        return ImageHeader(image.shape[1], image.shape[0], 1 if grey else 3, 8), frames, rate
-
     def _same_layout(self, headers: dict[Path, ImageHeader]) -> ImageHeader:
         usual, _ = Counter(header.layout for header in headers.values()).most_common(1)[0]
         like, right = next((p.name, h) for p, h in headers.items() if h.layout == usual)
@@ -435,7 +362,7 @@ class ReplayCamera(Camera):
         if recording.video is None:
             return None, ""
         if self._video is None:
-            self._video = self._at(recording.video, "grab", _Video)
+            self._video = self._at(recording.video, "grab", VideoFile)
             self._video.skip(index - len(recording.images))
         number = self._video.next
         image = self._video.read()

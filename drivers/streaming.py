@@ -56,6 +56,7 @@ class StreamingOptions(Options, frozen=True, kw_only=True):
     roi: tuple[int, int, int, int] | None = None  # x, y, width, height
     black_level: float = 0.0  # nominal counts in the dark
     buffers: int = 8
+    rolling_ms: float = 0.0  # of a rolling shutter: from the first row's exposure to the last's
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,8 +161,8 @@ class StreamingCamera(Camera):
         try:
             with self._errors("connect"):
                 self._identity = self._open()
-                self._apply(_merged(stated, self._wanted), "connect")
-                self._info, self._settings = self._read()
+                self._apply(merged(stated, self._wanted), "connect")
+                self._take_in()
         except BaseException:
             self.close()
             raise
@@ -211,9 +212,14 @@ class StreamingCamera(Camera):
             raise self._refused("configure", "it is acquiring", "stop it first")
         with self._errors("configure"):
             self._apply(wanted, "configure")
-            self._info, self._settings = self._read()
-        self._wanted = _merged(self._wanted, wanted)
+            self._take_in()
+        self._wanted = merged(self._wanted, wanted)
         return self._settings
+
+    def _take_in(self) -> None:
+        """Ask what is in force. No camera says how its shutter rolls: the options do."""
+        info, self._settings = self._read()
+        self._info = replace(info, rolling_s=self.options.rolling_ms / 1e3)
 
     # ------------------------------------------------------------ acquisition
 
@@ -387,6 +393,7 @@ class StreamingCamera(Camera):
         return DeviceRefused(self.name, phase, problem, remedy)
 
 
-def _merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:
+def merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:
+    """The settings of `over`, and where it has none those of `under`."""
     given = {f.name: getattr(over, f.name) for f in fields(over)}
     return replace(under, **{name: v for name, v in given.items() if v is not None})

@@ -182,6 +182,8 @@ class RunInfo(Fact, frozen=True, kw_only=True):
     end: End | None = None
     products: tuple[Product, ...] = ()
     parents: tuple[str, ...] = ()
+    #: how exposures were kept in step with patterns: mode, why, warnings, counts
+    sequencing: dict[str, Any] | None = None
 
 
 class Waiting(Fact, frozen=True, kw_only=True):

@@ -35,6 +35,7 @@ Seed = Annotated[int, Meta(ge=0, le=2**53, description="of the random numbers")]
 SUN_DEG = 0.53  # angular diameter
 AXIS = "axis along which the pattern varies: x makes vertical stripes"
 LEAKAGE = "brightness b of an unlit source element as a fraction of a lit one"
+MODE = "how frames are kept in step with patterns: see docs/projectors.md"
 ESTIMATOR = "how frames become components; maxmin is the paper's, auto the best for the method"
 
 
@@ -168,6 +169,10 @@ class PatternScan(Scan, frozen=True, kw_only=True):
         | None
     ) = None
     lit_fraction: LitFraction | None = None  # None: the pattern's own
+    #: None: as rig.toml says
+    mode: (
+        Annotated[Literal["auto", "hardware", "software", "free"], Meta(description=MODE)] | None
+    ) = None
     estimator: Annotated[Literal["auto", "maxmin", "topk", "lsq"], Meta(description=ESTIMATOR)] = (
         "auto"
     )

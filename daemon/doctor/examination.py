@@ -118,6 +118,10 @@ class Doctor:
                 "projector: light",
                 lambda: exposing.projector_checks(camera, projector, session, self._rig.clock),
             )
+            if projector.device.info().sequences and "hardware" in camera_info.triggers:
+                yield from self._tried(
+                    "camera: trigger wire", lambda: [exposing.wiring(camera, projector, session)]
+                )
         for name, light in self._rig.lights.items():
             yield from self._tried(
                 f"light: {name}", partial(exposing.light_checks, camera, name, light, session)

@@ -10,8 +10,18 @@ import numpy as np
 
 from daemon.devicethread import DeviceThread, Session
 from daemon.doctor.verdict import failed, ok, skipped, warning
-from drivers.base import Acquisition, Camera, DeviceRefused, Light, Projector
+from daemon.exposing.modes import whole_periods
+from drivers.base import (
+    Acquisition,
+    Camera,
+    DeviceRefused,
+    DeviceTimeout,
+    Frame,
+    Light,
+    Projector,
+)
 from drivers.clock import NS, Clock
+from drivers.sequence import mismatch
 from protocol.messages import Check
 
 SHOTS = 4
@@ -20,6 +30,7 @@ SETTLE_S = 0.3
 _PATIENCE_S = 2.0
 _CALL_S = 5.0
 _LATE_S = 0.25
+_WIRE_S = 0.5  # a frame that no pulse has asked for by then does not come
 _SEEN = 0.01  # of full scale: what light must change at least
 _SATURATED = 0.01
 
@@ -124,9 +135,9 @@ def periods(exposure_us: float, refresh_hz: float) -> Check:
     name = "camera: exposure"
     ratio = exposure_us * 1e-6 * refresh_hz
     told = f"{exposure_us / 1e3:.2f} ms are {ratio:.2f} periods of the projector"
-    if ratio > 0.98 and abs(ratio - round(ratio)) < 0.02 * max(1.0, ratio):
+    whole = whole_periods(exposure_us, refresh_hz)
+    if whole is None:
         return ok(name, told)
-    whole = max(1, round(ratio)) / refresh_hz * 1e6
     return warning(
         name,
         f"{told}: one that flickers (colour wheel, PWM) makes stripes and noise",
@@ -195,6 +206,66 @@ def projector_checks(
     projector.call(lambda p: p.safe(), _CALL_S, session)
     checks.append(periods(light.exposure_us, info.refresh_hz))
     return checks
+
+
+def wiring(
+    camera: DeviceThread[Camera], projector: DeviceThread[Projector], session: Session
+) -> Check:
+    """Whether the projector's trigger output makes the camera expose, once an image and in order: a
+    sequence of white and black images in turn. Raises DeviceError."""
+    name = "camera: trigger wire"
+    info, seen = camera.device.info(), projector.device.info()
+    limits = seen.sequence
+    assert limits is not None
+    exposure_us = camera.device.settings().exposure_us or 0.0
+    period_us = max(limits.period_us[0], 1.2 * exposure_us + 1e6 * info.readout_s + 1000.0)
+    levels = (255, 0) * (SHOTS // 2)
+    images = [np.full((seen.height, seen.width), level, np.uint8) for level in levels]
+    try:
+        loaded = projector.call(lambda p: p.load(images, period_us, period_us), _CALL_S, session)
+    except DeviceRefused as error:
+        return skipped(name, f"{error.problem}; {error.remedy}")
+
+    def ready(device: Camera) -> None:
+        device.stop()
+        device.start(Acquisition.HARDWARE)
+
+    def frames(device: Camera) -> list[tuple[Frame, float]]:
+        """All that come, and how bright they are; one more than there should be, if it comes."""
+        out = np.zeros(info.shape, info.pixel_format.dtype)
+        came: list[tuple[Frame, float]] = []
+        try:
+            while len(came) <= loaded.images:
+                frame = device.grab(out, 2 * loaded.period_us / 1e6 + info.readout_s + _WIRE_S)
+                came.append((frame, float(frame.pixels.mean())))
+        except DeviceTimeout:
+            pass  # no more pulses: what the number says is judged below
+        finally:
+            device.stop()
+        return came
+
+    camera.call(ready, _CALL_S, session)
+    began = projector.call(lambda p: p.run(), _CALL_S, session)
+    came = camera.call(frames, (loaded.images + 1) * _CALL_S, session)
+    projector.call(lambda p: p.stop(), _CALL_S, session)
+    remedy = (
+        "check the wire from the projector's trigger output, its level, and the camera's "
+        "`trigger_line` and `trigger_edge`: docs/hardware.md, Hardware trigger"
+    )
+    if not came:
+        return failed(name, f"no frame came for {loaded.images} pulses", remedy)
+    if problem := mismatch(loaded, [frame for frame, _ in came], began):
+        return failed(name, problem, remedy)
+    if not all(b < a for a, b in zip(*[iter(m for _, m in came)] * 2, strict=True)):
+        return failed(
+            name,
+            "as many frames as images, but white and black ones do not take turns",
+            "the other edge of the pulse (`trigger_edge`)? light that comes later than its pulse "
+            "(`trigger_delay_us`)? the lens cap?",
+        )
+    return ok(
+        name, f"{len(came)} images, {len(came)} frames, {loaded.period_us / 1e3:.2f} ms apart"
+    )
 
 
 def light_checks(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from daemon.scans.method import Bench, Circle, Unsuitable
 from daemon.scans.occluder import OccluderMethod
@@ -33,6 +33,10 @@ class MeshMethod(OccluderMethod[Mesh]):
 
     def __init__(self, spec: Mesh, bench: Bench) -> None:
         self.warnings: tuple[str, ...] = ()
+        self._umbra: dict[str, Any] = {
+            "leakage_from": "not known: say the mesh's holes and pitch and its distance to the "
+            "scene (--hole-mm, --pitch-mm, --scene-mm)"
+        }
         self._mesh = _mesh_of(spec)
         wanted = spec.references or ()
         live = not bench.camera.recorded
@@ -117,6 +121,12 @@ class MeshMethod(OccluderMethod[Mesh]):
                 )
         if asked.leak > 0.0:
             warnings.append(f"up to {asked.leak:.0%} of the source still reaches the umbra")
+        if spec.scene_mm is not None:
+            self._umbra = {
+                "penumbra_mm": round(penumbra, 3),
+                "leakage_at_most": round(asked.leak, 4),
+                "leakage_from": "the mesh's geometry",
+            }
         feed = spec.feed_mm_s or best.feed_mm_s * radius / best.circle.radius_mm
         if feed > 2.0 * best.feed_mm_s * radius / best.circle.radius_mm:
             warnings.append(
@@ -135,11 +145,12 @@ class MeshMethod(OccluderMethod[Mesh]):
         )
 
     def conclude(self, components: Components) -> Components:
-        """See `Method`: with the warnings among the facts."""
+        """See `Method`: with what geometry says of the umbra, and the warnings, among the facts."""
         components = super().conclude(components)
-        if not self.warnings:
-            return components
-        return replace(components, facts={**components.facts, "warnings": list(self.warnings)})
+        facts = {**components.facts, **self._umbra}
+        if self.warnings:
+            facts["warnings"] = list(self.warnings)
+        return replace(components, facts=facts)
 
 
 def _mesh_of(spec: Mesh) -> geometry.Mesh | None:

@@ -43,9 +43,10 @@ _LEAST_SIDE = 200
 _FLOOR = 0.03  # of the bright places: added to light, so that the dark ones' noise has no say
 _FOLLOWED = 0.25  # of the differences: only a mesh that was taken for the scene explains so much
 _TAPER = 0.08  # part of the picture at each edge that fades out
-_SHORTEST = (24, 16, 12, 8, 6, 4, 3, 2, *[1] * 8)
-"""Wavelengths, in small pixels, that count in each round of aligning the first frames: a shake
-leaves long ones in the mean, and blurs the short ones away until the frames are aligned."""
+_SHORTEST = (1, 16, 8, 4, 2, 1, 1, 1, 1)
+"""Wavelengths, in small pixels, that count in each round of aligning the first frames: all, to see
+whether they lie apart at all; then long ones first, which a shake leaves in the mean."""
+_SAMPLED = 6  # every so many of the first frames show how far halves of the waves agree
 
 _STEPS = 6  # of refining a peak
 _PEAK = 5.0  # deviations of the correlation by which a peak is told from chance
@@ -184,7 +185,8 @@ class Registration:
                 x, y, _ = self._find(spectrum, (seen * others / shadow).astype(np.complex64))
                 shifts[k] = x, y
             shifts -= np.median(shifts, axis=0)
-            if shortest == _SHORTEST[-1] and np.abs(shifts - before).max() < 0.01:
+            change = np.abs(shifts - before).max() * self._factor
+            if shortest == 1 and change < LEAST_PX / 2:
                 break
         moved = [self._moved(s, *d) for s, d in zip(self._first, shifts, strict=True)]
         mean = np.mean(moved, axis=0)
@@ -204,7 +206,10 @@ class Registration:
         rows, columns = np.indices(mean.shape)
         odd = (rows + columns) % 2 == 1
         found = [
-            [self._find(s, (part * mean / shadow).astype(np.complex64))[:2] for s in self._first]
+            [
+                self._find(s, (part * mean / shadow).astype(np.complex64))[:2]
+                for s in self._first[::_SAMPLED]
+            ]
             for part in (odd, ~odd)
         ]
         apart = np.subtract(*np.asarray(found))

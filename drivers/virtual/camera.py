@@ -6,7 +6,8 @@ import threading
 from collections import deque
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from typing import Annotated, Any
+from itertools import pairwise
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -39,6 +40,7 @@ CORRECT_US = 1e6 / 60  # with this exposure and no gain ...
 CORRECT_LEVEL = 0.8  # ... radiance 1 gives this part of the scale
 EXPOSURE_US = (20.0, 10e6)
 GAIN_DB = (0.0, 36.0)
+ROLLING_BANDS = 16  # rows of a rolling shutter are exposed in so many groups
 LUMINANCE = np.asarray((0.30, 0.59, 0.11), np.float32)  # a mono sensor's response
 
 
@@ -53,6 +55,13 @@ class CameraOptions(VirtualOptions, frozen=True, kw_only=True, forbid_unknown_fi
     frame_rate_hz: Annotated[float, Meta(gt=0)] = 30.0  # free-running
     trigger_latency_us: Annotated[float, Meta(ge=0)] = 50.0
     readout_ms: Annotated[float, Meta(ge=0)] = 4.0
+    rolling_ms: Annotated[float, Meta(ge=0)] = 0.0  # a rolling shutter: from first row to last
+    rolling_told: bool = True  # whether it says so
+    triggers: tuple[Literal["software", "hardware", "none"], ...] = (
+        "software",
+        "hardware",
+        "none",
+    )  # what it takes; "none": it can run free
     buffers: Annotated[int, Meta(ge=1, le=256)] = 8  # frames that wait in the driver
     black_level: Annotated[float, Meta(ge=0)] | None = None  # counts; None: 1/64 of full scale
     full_well_e: Annotated[float, Meta(gt=0)] = 10_500.0  # electrons at full scale without gain
@@ -73,7 +82,8 @@ class _Exposure:
 
 
 class VirtualCamera(VirtualDevice, Camera):
-    """A camera with a global shutter that integrates the light of the bench, frame by frame.
+    """A camera that integrates the light of the bench, frame by frame: all rows at once, or, where
+    its shutter rolls, the last one `rolling_ms` after the first.
 
     Software-triggered: an exposure begins `trigger_latency_us` after its trigger, or when the
     sensor is free. Hardware-triggered: the same after each pulse on the bench's line, but a pulse
@@ -168,7 +178,10 @@ class VirtualCamera(VirtualDevice, Camera):
             gain_unit="dB",
             max_rate_hz=NS / fastest,
             readout_s=self._o.readout_ms / 1e3,
-            triggers=("software", "hardware") if self.bench.line else ("software",),
+            rolling_s=self._o.rolling_ms / 1e3 if self._o.rolling_told else 0.0,
+            triggers=tuple(
+                t for t in self._o.triggers if t != "hardware" or self.bench.line is not None
+            ),
         )
 
     def facts(self) -> dict[str, Any]:
@@ -222,6 +235,11 @@ class VirtualCamera(VirtualDevice, Camera):
         """See Camera."""
         self._begin("start")
         line = self.bench.line
+        wanted = "none" if acquisition is Acquisition.FREE else acquisition.value
+        if wanted not in self._o.triggers:
+            raise self._refuse(
+                "start", f"it has no {acquisition} mode", f"it has {', '.join(self._o.triggers)}"
+            )
         if acquisition is Acquisition.HARDWARE:
             if line is None:
                 raise self._refuse(
@@ -280,13 +298,18 @@ class VirtualCamera(VirtualDevice, Camera):
             while (pulse := line.after(self._heard)) is not None and pulse <= now:
                 self._heard = pulse
                 start = pulse + round(self._o.trigger_latency_us * 1e3)
-                missed = Fault.DROP_TRIGGER in self.faults.strike("trigger", self._halted)
+                kinds = self.faults.strike("trigger", self._halted)
+                missed = Fault.DROP_TRIGGER in kinds
                 if missed or start < self._free:
                     continue
-                end = start + round(self._exposure_us * 1e3)
-                self._free = start + self._period_ns
-                self._queue(start, end)
+                self._expose_at(start)
+                if Fault.FALSE_TRIGGER in kinds:
+                    self._expose_at(self._free)
             return pulse
+
+    def _expose_at(self, start: int) -> None:
+        self._free = start + self._period_ns
+        self._queue(start, start + round(self._exposure_us * 1e3))
 
     def _run(self) -> None:
         """Expose all that a free-running camera has exposed by now, and the one in the making;
@@ -320,12 +343,14 @@ class VirtualCamera(VirtualDevice, Camera):
             halted = self.clock.wait_until(deadline, self._halted)
             raise self._late(halted, timeout_s, "was it triggered?")
         exposure = self._waiting[0]
-        there = exposure.end_ns + round(self._o.readout_ms * 1e6)
+        there = exposure.end_ns + round((self._o.readout_ms + self._o.rolling_ms) * 1e6)
         halted = self.clock.wait_until(min(there, deadline), self._halted)
         if halted or there > deadline:
             raise self._late(halted, timeout_s, "allow for the exposure and the readout")
         self._waiting.popleft()
         complete = self._expose(exposure, out)
+        if Fault.TORN_FRAME in kinds and self._last is not None:
+            out[: shape[0] // 2] = self._last[0][: shape[0] // 2]
         if Fault.INCOMPLETE_FRAME in kinds:
             out[shape[0] // 2 :] = 0
             complete = False
@@ -396,6 +421,19 @@ class VirtualCamera(VirtualDevice, Camera):
         x, y, width, height = self._roi
         return picture[y : y + height, x : x + width]
 
+    def _radiance(self, start_ns: int, end_ns: int, layouts: tuple[str, ...]) -> list[F32]:
+        """The bench's, each band of rows at its own time where the shutter rolls."""
+        rolling = round(self._o.rolling_ms * 1e6)
+        if not rolling:
+            return self.bench.radiance(start_ns, end_ns, self._size, layouts)
+        edges = np.linspace(0, self._o.height, ROLLING_BANDS + 1).astype(int)
+        bands = []
+        for k, (top, below) in enumerate(pairwise(edges)):
+            later = round(rolling * k / (ROLLING_BANDS - 1))
+            planes = self.bench.radiance(start_ns + later, end_ns + later, self._size, layouts)
+            bands.append([plane[top:below] for plane in planes])
+        return [np.concatenate(of_layout) for of_layout in zip(*bands, strict=True)]
+
     def _light(self, start_ns: int, end_ns: int, rng: np.random.Generator) -> list[F32]:
         """Mean radiance, one plane a layout. Raises Forgotten."""
         dx, dy = rng.normal(0, self._o.shake_px, 2) if self._o.shake_px else (0.0, 0.0)
@@ -404,7 +442,7 @@ class VirtualCamera(VirtualDevice, Camera):
             dx, dy = dx + sway[0], dy + sway[1]
         still = not (dx or dy)
         layouts = self._layouts() if still else ("R", "G", "B")
-        planes = self.bench.radiance(start_ns, end_ns, self._size, layouts)
+        planes = self._radiance(start_ns, end_ns, layouts)
         if self._o.ambient:
             for k, layout in enumerate(layouts):
                 planes[k] += np.float32(self._o.ambient) * _room(*self._size, layout)

@@ -30,6 +30,8 @@ class Fault(enum.StrEnum):
     DROP_TRIGGER = "drop-trigger"  # the camera does not hear a trigger
     DUPLICATE_FRAME = "duplicate-frame"  # the camera gives the frame before once more
     INCOMPLETE_FRAME = "incomplete-frame"  # the lower half of a frame is missing
+    TORN_FRAME = "torn-frame"  # the upper half of a frame is that of the frame before
+    FALSE_TRIGGER = "false-trigger"  # the camera hears a pulse that the projector did not send
     NO_SWITCH = "no-switch"  # the stage's homing finds no limit switch
     LATE_FLIP = "late-flip"  # the projector flips one refresh later than it says
 
@@ -38,6 +40,8 @@ MAIN_OF = {
     Fault.DROP_TRIGGER: "trigger",
     Fault.DUPLICATE_FRAME: "grab",
     Fault.INCOMPLETE_FRAME: "grab",
+    Fault.TORN_FRAME: "grab",
+    Fault.FALSE_TRIGGER: "trigger",
     Fault.LATE_FLIP: "show",
     Fault.NO_SWITCH: "home",
 }

@@ -1,7 +1,8 @@
 """Real drivers over emulated devices: a display on a screenless X server, Basler's emulation.
 
 Pace: a calibration of the tone (its frames need not look like their patterns, and the emulation
-does not see the screen) against what the screen's refresh and the exposure allow, as in `pace`.
+does not see the screen) against what the screen's refresh and the exposure allow, as in `pace`. A
+screenless server's refresh is a timer that begins anew at a flip, so more than 1 is possible.
 
 Bandwidth: a recording of one second after the other at rising frame rates, recorded and separated
 while frames arrive; the highest rate at which no frame is missing, against the same bytes written
@@ -30,7 +31,8 @@ from tests.benchmarks.bench import Running, daemon
 from tests.benchmarks.ratio import Ratio, Skipped
 from tests.drivers.xserver import screen_tools_missing, xvfb
 
-EXPOSURES_S = {"one refresh": 1 / 62, "10 ms": 10e-3}
+EXPOSURES = {"one refresh": 1.0, "0.6 of a refresh": 0.6}
+LATENCY_S = 100e-6  # from the emulation's trigger to its exposure
 WIDTH, HEIGHT = 1280, 1024
 SECONDS = 3.0
 RATES = (5.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0, 50.0, 65.0, 80.0, 100.0, 130.0, 160.0, 200.0)
@@ -58,7 +60,8 @@ def _pace() -> Iterator[Ratio]:
         with daemon(devices) as rig:
             (shown,) = [d for d in rig.client.status().devices if d.kind == "projector"]
             refresh_hz = float(shown.facts["refresh_hz"])
-            for name, exposure_s in EXPOSURES_S.items():
+            for name, refreshes in EXPOSURES.items():
+                exposure_s = refreshes / refresh_hz
                 spec = CalibrateTone(levels=33, exposure_us=exposure_s * 1e6)
                 before = _cpu_s(rig)
                 done = rig.client.scan(spec).wait(120, check=False)
@@ -67,7 +70,7 @@ def _pace() -> Iterator[Ratio]:
                 starts = [r.start_ns for r in records if r.observation.used]
                 taken_s = float(np.median(np.diff(starts))) / 1e9
                 mean_s = (starts[-1] - starts[0]) / (len(starts) - 1) / 1e9
-                ideal_s = math.ceil(exposure_s * refresh_hz) / refresh_hz
+                ideal_s = math.ceil((exposure_s + LATENCY_S) * refresh_hz) / refresh_hz
                 yield Ratio(
                     name=f"display + pylon pace, exposure of {name}",
                     value=ideal_s / mean_s,

@@ -14,7 +14,8 @@ from tests.daemon.outdoor_rig import Outdoors, scan
 
 SPEC = Mesh(hole_mm=25.0, pitch_mm=40.0, scene_mm=150.0, sun=True, time_limit_s=60.0)
 STAGE = {"hole_mm": 25.0, "pitch_mm": 40.0}
-CAMERA = {"width": 208, "height": 156, "frame_rate_hz": 12.0}
+CAMERA = {"width": 208, "height": 156, "frame_rate_hz": 12.0, "exposure_us": 4000.0}
+SUN = {"strength": 4.0}  # exposed as briefly: the mesh moves less, and is drawn faster
 CLOUDS = (
     (0.0, 1.0),
     (13.0, 1.0),
@@ -30,13 +31,14 @@ FULL_SCALE = 4095.0
 
 @functools.cache
 def under(weather: str, seed: int) -> Outdoors:
-    sun: dict[str, Any] = {"drift_deg_per_hour": 0.0}
+    sun: dict[str, Any] = {**SUN, "drift_deg_per_hour": 0.0}
     camera: dict[str, Any] = {**CAMERA, "seed": seed}
     if weather != "steady":
-        sun = {"clouds": CLOUDS}
+        sun = {**SUN, "clouds": CLOUDS}
     if weather == "rough":
         camera["gusts"] = GUSTS
-    return scan(SPEC, stage=STAGE, sun=sun, camera=camera, frames=170)
+    frames = 140 if weather == "steady" else 170
+    return scan(SPEC, stage=STAGE, sun=sun, camera=camera, frames=frames)
 
 
 def apart(one: Outdoors, other: Outdoors) -> NDArray[np.float64]:
@@ -58,6 +60,8 @@ def test_drift_and_clouds_change_nothing_beyond_the_noise() -> None:
     cloudy = under("cloudy", 3)
     rejected = cloudy.components.facts["rejected"]
     assert rejected["cloud"] > 20
+    assert steady.components.facts["penumbra_mm"] == pytest.approx(1.4, abs=0.2)
+    assert steady.components.facts["leakage_at_most"] == 0.0
     noise, found = apart(steady, under("steady", 2)), apart(steady, cloudy)
     assert rms(found[0]) < 1.2 * rms(noise[0])
     assert rms(found[1]) < 1.3 * rms(noise[1])

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.patterns import render
-from daemon.proof import Proof, expected_level
+from daemon.proof import Proof, head_problem, look_of
 from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting
 from protocol.patterns import BLACK, WHITE, AnyPattern, Checker, GrayCode, Solid
@@ -40,8 +40,8 @@ def step(pattern: AnyPattern, lighting: Lighting = Lighting.PATTERN) -> Expose:
 
 def judged(proof: Proof, scene: Scene, asked: Expose, shown: AnyPattern | None = None) -> str:
     assert asked.pattern is not None
-    expected = expected_level(render(asked.pattern, W, H))
-    return proof.problem(scene.frame(shown or asked.pattern), asked, expected)
+    look = look_of(render(asked.pattern, W, H))
+    return proof.problem(scene.frame(shown or asked.pattern), asked, look)
 
 
 def begun(scene: Scene) -> Proof:
@@ -100,6 +100,87 @@ def test_a_coarse_pattern_says_nothing_of_the_level() -> None:
             assert judged(proof, scene, asked) == ""
 
 
+class Torn(Scene):
+    """Rows from `row` on, or up to it, are of another image."""
+
+    def torn(self, upper: AnyPattern, lower: AnyPattern, row: int = H // 2) -> Pixels:
+        return np.concatenate([self.frame(upper)[:row], self.frame(lower)[row:]])
+
+
+def seen(proof: Proof, pixels: Pixels, asked: Expose) -> str:
+    assert asked.pattern is not None
+    return proof.problem(pixels, asked, look_of(render(asked.pattern, W, H)))
+
+
+@pytest.mark.parametrize("row", [H // 4, H // 2, 3 * H // 4])
+def test_a_frame_of_two_patterns_is_torn(row: int) -> None:
+    scene = Torn()
+    proof = begun(scene)
+    for pattern in SHIFTS[:5]:
+        assert judged(proof, scene, step(pattern)) == ""
+    asked = step(SHIFTS[5])
+    upper = seen(proof, scene.torn(SHIFTS[4], SHIFTS[5], row), asked)
+    assert upper == "a frame is torn: its upper part shows the pattern before its own"
+    lower = seen(proof, scene.torn(SHIFTS[5], SHIFTS[4], row), asked)
+    assert lower == "a frame is torn: its lower part shows the pattern before its own"
+    assert judged(proof, scene, asked) == ""  # exposed again
+
+
+def test_a_pattern_torn_with_what_was_before_it() -> None:
+    scene = Torn()
+    proof = begun(scene)
+    asked = step(SHIFTS[0])
+    found = seen(proof, scene.torn(WHITE, SHIFTS[0]), asked)
+    assert found == "a frame is torn: its upper part has not the light of its pattern"
+    assert "lower part has not" in seen(proof, scene.torn(SHIFTS[0], BLACK), asked)
+    assert judged(proof, scene, asked) == ""
+
+
+def test_a_white_frame_that_the_next_pattern_cut_short() -> None:
+    # Every frame of a camera whose rolling shutter nobody spoke of: black ends in white ...
+    scene = Torn()
+    proof = Proof()
+    seen(proof, scene.torn(BLACK, WHITE), step(BLACK, Lighting.BLACK))
+    found = seen(proof, scene.torn(WHITE, SHIFTS[0]), step(WHITE, Lighting.WHITE))
+    assert found == "a frame is torn: its lower part is darker than in the black frame"
+
+
+def test_a_torn_white_frame_is_told_by_the_patterns_after_it() -> None:
+    scene = Torn()
+    proof = Proof()
+    judged(proof, scene, step(BLACK, Lighting.BLACK))
+    seen(proof, scene.torn(BLACK, WHITE), step(WHITE, Lighting.WHITE))
+    assert "upper part is brighter than in the white" in judged(proof, scene, step(SHIFTS[0]))
+
+
+def test_half_a_scene_that_the_projector_does_not_reach_is_not_torn() -> None:
+    scene = Scene()
+    scene.albedo[: H // 2] = 0.0
+    proof = begun(scene)
+    assert [judged(proof, scene, step(p)) for p in SHIFTS] == [""] * len(SHIFTS)
+
+
+def test_a_trial_leaves_no_trace() -> None:
+    scene = Scene()
+    proof = begun(scene)
+    trial = proof.fork()
+    for pattern in SHIFTS:
+        assert judged(trial, scene, step(pattern)) == ""
+    assert "the pattern before" in judged(trial, scene, step(SHIFTS[0]), shown=SHIFTS[5])
+    assert judged(proof, scene, step(SHIFTS[0]), shown=SHIFTS[5]) == ""  # it never saw them
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "late"),
+    [(WHITE, BLACK, False), (None, WHITE, True), (BLACK, SHIFTS[0], True)],
+)
+def test_the_head_of_a_sequence(first: AnyPattern | None, second: AnyPattern, late: bool) -> None:
+    scene = Scene()
+    dark = (scene.rng.normal(AMBIENT, SIGMA, (H, W))).astype(np.uint16)
+    white = dark if first is None else scene.frame(first)
+    assert ("not in step" in head_problem(white, scene.frame(second))) is late
+
+
 FULL = 4095
 EXPOSURES = (None, 20_000.0, 80_000.0)
 
@@ -110,7 +191,7 @@ def bracketed(
     assert asked.pattern is not None
     light = scene.frame(shown or asked.pattern).astype(np.float64) * factor
     counts: Pixels = np.minimum(light, FULL).astype(np.uint16)
-    return proof.problem(counts, asked, expected_level(render(asked.pattern, W, H)))
+    return proof.problem(counts, asked, look_of(render(asked.pattern, W, H)))
 
 
 @pytest.mark.parametrize("longest", [4.0, 64.0])  # half of the scene is saturated; all of it

@@ -173,6 +173,25 @@ def test_a_gust_is_aligned_and_a_fall_is_left_out() -> None:
     assert apart(mended) < 0.4 * apart(broken)
 
 
+def test_an_interrupted_scan_goes_on_with_the_same_decisions() -> None:
+    shifts = [*shaken(REFERENCE, 2.0), *shaken(12, 4.0, seed=9)]
+    shots = frames(shifts)
+    _, decided = separated(shifts, align=True)
+    assert decided[REFERENCE - 1].fresh  # it shook before
+    bench = Bench(
+        CameraInfo(WIDTH, HEIGHT, PixelFormat.MONO16), stage=StageInfo(((0, 500), (0, 300)), 100.0)
+    )
+    method = method_for(Mesh(hole_mm=HOLES.hole_mm, pitch_mm=HOLES.pitch_mm), bench)
+    step = method.step(0, {})
+    assert step is not None
+    cut = REFERENCE + 4
+    for frame, observation in zip(shots[:cut], decided[:cut], strict=True):
+        method.recall(frame, observation)
+    for k in range(cut, len(shots)):
+        taken = Taken(0, k, incomplete=False, pixels=shots[k])
+        assert method.observe(step, taken) == decided[k]
+
+
 def test_still_frames_are_used_as_they_are() -> None:
     still = [(0.0, 0.0)] * (REFERENCE + 20)
     one, decided = separated(still, align=True)

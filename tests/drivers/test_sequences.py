@@ -280,6 +280,6 @@ def test_a_camera_alone_on_the_bench_has_no_trigger_line() -> None:
     camera = build("camera", "virtual", "c", {"width": 64, "height": 48}, Context())
     camera.connect()
     assert isinstance(camera, VirtualCamera)
-    assert camera.info().triggers == ("software",)
+    assert camera.info().triggers == ("software", "none")
     with pytest.raises(DeviceRefused, match="sends it triggers"):
         camera.start(Acquisition.HARDWARE)

@@ -29,19 +29,22 @@ def test_a_sound_rig(daemon: Daemon) -> None:
         assert Outcome.FAILED not in found.values(), checks
         exposed = {
             "projector: refresh", "camera: trigger", "projector: light", "projector: latency",
-            "camera: exposure", "light: left",
+            "camera: exposure", "camera: trigger wire", "light: left",
         }  # fmt: skip
         assert exposed <= set(found)
-        assert found["camera: trigger"] is found["light: left"] is Outcome.OK
+        for name in ("camera: trigger", "camera: trigger wire", "light: left"):
+            assert found[name] is Outcome.OK, checks
         assert rig.status().state is RigState.IDLE
 
 
 def test_light_that_comes_later_than_the_projector_says(daemon: Daemon) -> None:
     daemon.configure(projector="hidden_latency_ms = 9")
     with daemon.start() as rig:
-        late = {c.name: c for c in rig.examine()}["projector: latency"]
+        found = {c.name: c for c in rig.examine()}
+        late, wire = found["projector: latency"], found["camera: trigger wire"]
         assert late.outcome is Outcome.FAILED
         assert "calibrate latency" in late.remedy
+        assert "do not take turns" in wire.message
 
 
 def test_a_camera_that_hears_no_trigger(daemon: Daemon) -> None:
@@ -52,6 +55,17 @@ def test_a_camera_that_hears_no_trigger(daemon: Daemon) -> None:
         assert "triggered" in found["camera: trigger"].remedy
         assert found["projector: light"].outcome is Outcome.OK  # the rest was looked at
         assert found["camera: exposure"].outcome is Outcome.WARNING
+
+
+def test_a_wire_that_loses_a_pulse(daemon: Daemon) -> None:
+    daemon.configure(camera='faults = ["drop-trigger@9"]\nexposure_us = 10000', scale=1)
+    with daemon.start() as rig:
+        found = {c.name: c for c in rig.examine()}
+        assert found["camera: trigger"].outcome is Outcome.OK
+        wire = found["camera: trigger wire"]
+        assert wire.outcome is Outcome.FAILED
+        assert wire.message == "3 frames for 4 images: a trigger was missed or false"
+        assert "trigger_line" in wire.remedy
 
 
 def test_a_rig_in_the_dark(daemon: Daemon) -> None:
@@ -87,7 +101,7 @@ def test_the_command_line(daemon: Daemon) -> None:
         shown = doctor()
         assert shown.returncode == 1
         assert "-> umbra calibrate latency" in shown.stdout
-        assert "1 failed" in shown.stdout.splitlines()[-1]
+        assert "2 failed" in shown.stdout.splitlines()[-1]  # pulses are as early
         passive = doctor("--passive", "--json")
         assert passive.returncode == 0
         assert {"name", "outcome", "message", "remedy"} <= set(

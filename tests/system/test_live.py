@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 import umbra
+from drivers.registry import UnknownDriver, load
 from protocol.client import EventStream
 from protocol.errors import Code, UmbraError
 from protocol.messages import PreviewTaken, RigState, RunState
@@ -161,3 +163,23 @@ def test_a_preview_is_of_now_and_tells_its_age_where_it_is_not(
         assert mean() < white / 2
         before = rig.preview().facts["age_s"]
         until(lambda: rig.preview().facts["age_s"] > before + 0.3)
+
+
+def test_a_camera_that_only_runs_free(daemon: Daemon) -> None:
+    try:
+        load("camera", "gentl")
+    except UnknownDriver as missing:
+        pytest.skip(str(missing))
+    package = importlib.util.find_spec("genicam")
+    assert package is not None
+    producer = next(Path((package.submodule_search_locations or [""])[0]).rglob("viky.cti"))
+    text = daemon.config.read_text().replace("time_scale = 4", "")
+    before, _, _ = text.partition("[projector]")
+    camera = f'[camera]\ndriver = "gentl"\nproducer = "{producer}"\nserial = "0"\n'
+    daemon.config.write_text(before + camera)
+    with daemon.start() as rig, rig.subscribe("preview") as events:
+        assert rig.snap().pixels.shape == (400, 400, 3)
+        rig.live(rate_hz=5)
+        coming(events, 3)
+        assert rig.snap().pixels.max() > 0
+        rig.stop_live()

@@ -1,0 +1,391 @@
+"""Hardware mode: the projector times whole sequences and triggers the camera through them.
+
+    projector   |white|black|   0|   1| ... | n-1|dark
+    pulses      |     |     |    |    |     |
+    camera       ===   ===   ===  ===   ...  ===     and one more grab, that must give nothing
+
+Consecutive steps become one sequence, as long as projector and ring allow; the host only collects.
+That frame k shows image k is proven three times: there are exactly as many frames as images, none
+lost on its way, one period apart by the camera's own clock (drivers.sequence); the white and the
+black image at its head look bright and dark, so that the light is not a period late or early; and
+each frame looks like its pattern (daemon.proof). Frames are handed on only when all of it holds.
+Otherwise the whole sequence is run again, `attempts` times in all; then each of its frames is an
+explicit missing record. When no pulse ever gave a frame, the run fails: that is wiring.
+
+A pause calls a sequence off at once, and it is run again after it; so does a resumed run begin at
+the first frame that was not recorded. A step that no sequence can hold (a dark projector, a delay,
+grey levels where sequences are black and white) is exposed by itself, as in `single`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future
+from concurrent.futures import wait as wait_for
+from dataclasses import dataclass, replace
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from daemon.devicethread import Stuck
+from daemon.exposing.apparatus import CALL_S, SHOW_S, Apparatus, Drawing
+from daemon.exposing.exposer import Exposer
+from daemon.exposing.modes import GUARDS, Pace, pace
+from daemon.proof import Proof, head_problem
+from daemon.ring import Buffer
+from daemon.scans.method import Expose, Unsuitable
+from daemon.separation.estimator import Lighting
+from drivers.base import (
+    Acquisition,
+    Camera,
+    DeviceError,
+    DeviceGarbled,
+    DeviceRefused,
+    DeviceTimeout,
+    Frame,
+    LoadedSequence,
+    SequenceLimits,
+)
+from drivers.sequence import mismatch
+from protocol.patterns import BLACK, WHITE
+
+WAY = "hardware"
+IMAGES_BYTES = 256 << 20
+"""Memory that the images of a sequence may take."""
+_LOAD_S = 30.0
+_START_S = 1.0  # from `run` to the first pulse, beyond a frame's own deadline
+_BEYOND = 1.5  # periods after the last frame in which none may come
+_LOOK_S = 0.05  # how often a pause is looked for while a frame is waited for
+
+log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Shot:
+    """A frame that is wanted, with what to show for it."""
+
+    index: int
+    step: Expose
+    sub: int
+    drawing: Drawing
+
+
+class _CalledOff(Exception):
+    """A pause was asked for in the middle of a sequence."""
+
+
+class Sequences(Exposer):
+    """See the module."""
+
+    def __init__(self, apparatus: Apparatus, single: Exposer | None, *, strict: bool) -> None:
+        """`single` exposes what no sequence can hold (None: the camera cannot); where hardware mode
+        was asked for by name (`strict`), only what is not a matter of settings."""
+        assert apparatus.projector is not None
+        limits = apparatus.projector.device.info().sequence
+        assert limits is not None
+        self._its = apparatus
+        self._single = single
+        self._strict = strict
+        self._projector = apparatus.projector
+        self._limits: SequenceLimits = limits
+        self._most = limits.images  # fewer once the projector has refused so many
+        self._ahead: tuple[tuple[int, int], list[_Shot]] | None = None
+        self._told: set[str] = set()  # why steps are exposed by themselves
+
+    def settle(self) -> None:
+        """See Exposer."""
+        if self._single is not None:
+            self._single.settle()
+
+    def expose(self, index: int, step: Expose, first: int) -> tuple[int, int]:
+        """See Exposer."""
+        if first >= step.frames:
+            return index + 1, 0
+        at = (index, first)
+        shots = self._ahead[1] if self._ahead and self._ahead[0] == at else self._gather(*at)
+        self._ahead = None
+        if not shots or (len(shots) <= GUARDS and self._single is not None):
+            return self._alone(index, step, first)  # a sequence would be more guards than frames
+        self.settle()
+        self._its.set_exposure(step.exposure_us)
+        try:
+            return self._sequence(shots)
+        except _CalledOff:
+            return at
+        except DeviceRefused as error:
+            return self._refused(error, at, step, len(shots))
+
+    # ------------------------------------------------------------ which frames
+
+    def _gather(self, index: int, first: int) -> list[_Shot]:
+        """The frames from a place of the plan on that one sequence can hold."""
+        shots: list[_Shot] = []
+        drawing: Drawing | None = None
+        most, head = 0, index
+        while isinstance(step := self._its.method.step(index, self._its.recorder.summary), Expose):
+            if shots and step.exposure_us != shots[0].step.exposure_us:
+                break
+            if index == head:
+                most = self._room(step)
+            if not most or step.pattern is None or step.delay_s or len(shots) >= most:
+                break
+            if drawing is None or drawing.pattern != step.pattern:
+                drawing = self._its.draw(step.pattern)
+            if not self._has_levels(drawing.image):
+                break
+            room = most - len(shots)
+            subs = range(first, step.frames)[:room]
+            shots += [_Shot(index, step, sub, drawing) for sub in subs]
+            index, first = index + 1, 0
+        return shots
+
+    def _room(self, step: Expose) -> int:
+        """How many frames a sequence can hold at a step's exposure; 0: it can be none."""
+        try:
+            found = self._pace(step)
+        except Unsuitable as error:
+            if self._strict:
+                raise
+            self._tell(str(error))
+            return 0
+        info = self._projector.device.info()
+        images = min(found.images, self._most, IMAGES_BYTES // (info.width * info.height))
+        # Half of the ring: the other half is being recorded meanwhile.
+        return max(0, min(images - GUARDS, (self._its.ring.count + 1) // 2))
+
+    def _pace(self, step: Expose) -> Pace:
+        exposure_us = step.exposure_us or self._its.first_exposure_us or 0.0
+        return pace(self._its.info, self._limits, exposure_us, self._its.patience.period_us)
+
+    def _has_levels(self, image: NDArray[np.uint8]) -> bool:
+        """Whether sequences have the image's levels."""
+        if self._limits.bits > 1 or bool(((image == 0) | (image == 255)).all()):
+            return True
+        why = "a pattern has grey levels, and the projector's sequences are black and white only"
+        if self._strict:
+            raise Unsuitable(f"mode hardware: {why}: take mode auto or software", "$.mode")
+        self._tell(why)
+        return False
+
+    def _refused(
+        self, error: DeviceRefused, at: tuple[int, int], step: Expose, frames: int
+    ) -> tuple[int, int]:
+        """The projector will not have a sequence of so many frames: shorter, else one by one."""
+        if error.device != self._projector.device.name or error.phase != "load":
+            raise error
+        if frames > 1:
+            self._most = GUARDS + frames // 2
+            log.info("shorter sequences", images=self._most, problem=error.problem)
+            return at
+        if self._strict:
+            raise error
+        self._tell(str(error))
+        return self._alone(at[0], step, at[1])
+
+    def _alone(self, index: int, step: Expose, first: int) -> tuple[int, int]:
+        if self._single is None:
+            raise Unsuitable(
+                "a step needs a frame by itself, and the camera can only be triggered by the "
+                "projector's sequences"
+            )
+        return self._single.expose(index, step, first)
+
+    def _tell(self, why: str) -> None:
+        if why not in self._told:
+            self._told.add(why)
+            log.info("exposed one by one", reason=why)
+
+    # ------------------------------------------------------------ one sequence
+
+    def _sequence(self, shots: list[_Shot]) -> tuple[int, int]:
+        its = self._its
+        guards = self._guards()
+        shape, dtype = its.info.shape, its.info.pixel_format.dtype
+        scratch = [np.empty(shape, dtype) for _ in guards]
+        buffers: list[Buffer] = []
+        try:
+            while len(buffers) < len(shots):
+                buffers.append(its.buffer())
+            its.lit = None
+            its.acquire(Acquisition.HARDWARE)
+            loaded = self._load([*guards, *shots])
+            for attempt in range(1, its.patience.attempts + 1):
+                its.may_go_on()
+                found, problem = self._attempt(
+                    loaded, [*guards, *shots], [*scratch, *buffers, scratch[0]]
+                )
+                if not problem:
+                    for shot, frame in zip(shots, found[len(guards) :], strict=True):
+                        buffer = buffers.pop(0)
+                        its.put(shot.index, shot.step, shot.sub, frame, buffer, way=WAY)
+                    return self._after(shots[-1])
+                its.count("repeated")
+                log.warning(
+                    "sequence exposed again" if attempt < its.patience.attempts else "given up",
+                    step=shots[0].index,
+                    images=loaded.images,
+                    attempt=attempt,
+                    problem=problem,
+                )
+                if attempt < its.patience.attempts:
+                    its.acquire(Acquisition.HARDWARE)
+            if not found:
+                raise self._nothing_came(loaded)
+            for shot in shots:
+                its.miss(shot.index, shot.step, shot.sub, problem)
+            return self._after(shots[-1])
+        finally:
+            for buffer in buffers:
+                its.ring.give(buffer)
+
+    def _guards(self) -> list[_Shot]:
+        """White, then black. Light that is a period late makes them dark and white; early, black
+        and the first pattern: never the first brighter than the second."""
+        return [
+            _Shot(-1, Expose(pattern, lighting), 0, self._its.draw(pattern))
+            for pattern, lighting in ((WHITE, Lighting.WHITE), (BLACK, Lighting.BLACK))
+        ]
+
+    def _load(self, shots: Sequence[_Shot]) -> LoadedSequence:
+        images = [shot.drawing.image for shot in shots]
+        period_us = self._pace(shots[-1].step).period_us
+        return self._projector.call(
+            lambda p: p.load(images, period_us, period_us), _LOAD_S, self._its.session
+        )
+
+    def _after(self, shot: _Shot) -> tuple[int, int]:
+        """The place of the plan after a frame."""
+        more = shot.sub + 1 < shot.step.frames
+        return (shot.index, shot.sub + 1) if more else (shot.index + 1, 0)
+
+    def _attempt(
+        self, loaded: LoadedSequence, shots: Sequence[_Shot], buffers: Sequence[Buffer]
+    ) -> tuple[list[Frame], str]:
+        """Run the sequence once: the frames that came, and why they are not its images, or "".
+
+        `buffers` are one more than images: into the last one nothing may come.
+        Raises _CalledOff. Whatever happens, no pulse and no grab is left behind, and after a
+        failure the camera is stopped.
+        """
+        its = self._its
+        off = threading.Event()
+        first_s = its.frame_deadline() + _START_S
+        waits = [first_s] + [its.frame_deadline()] * (len(shots) - 1)
+        waits.append(_BEYOND * loaded.period_us * 1e-6)
+        grabs = [
+            self._grab(buffer, wait_s, off) for buffer, wait_s in zip(buffers, waits, strict=True)
+        ]
+        frames: list[Frame] = []
+        problem = "it was not run to its end"
+        try:
+            began_ns = self._projector.call(lambda p: p.run(), SHOW_S, its.session)
+            self._gather_ahead(shots[-1])
+            judges = its.looks.fork() if its.looks is not None else None
+            *awaited, beyond = zip(grabs, waits, strict=True)
+            problem = self._collect(awaited, shots, frames, judges, loaded, began_ns)
+            if not problem:
+                problem = self._one_more(*beyond, frames)
+            if not problem:
+                its.looks = judges
+        finally:
+            if problem:
+                self._call_off(grabs, off)
+        return frames, problem
+
+    def _grab(self, buffer: Buffer, wait_s: float, off: threading.Event) -> Future[Frame]:
+        def grab(camera: Camera) -> Frame:
+            if off.is_set():
+                raise DeviceTimeout(camera.name, "grab", "the sequence was called off")
+            return camera.grab(buffer, wait_s)
+
+        return self._its.camera.submit(grab, wait_s + CALL_S, self._its.session)
+
+    def _gather_ahead(self, last: _Shot) -> None:
+        """Draw the next sequence while this one is exposed."""
+        at = self._after(last)
+        if self._ahead is None or self._ahead[0] != at:
+            self._ahead = (at, self._gather(*at))
+
+    def _collect(
+        self,
+        grabs: Sequence[tuple[Future[Frame], float]],
+        shots: Sequence[_Shot],
+        frames: list[Frame],
+        judges: Proof | None,
+        loaded: LoadedSequence,
+        began_ns: int,
+    ) -> str:
+        """Take the frames in as they come, into `frames`; why they are not the images, or ""."""
+        for shot, (grab, wait_s) in zip(shots, grabs, strict=True):
+            try:
+                frames.append(self._wait(grab, wait_s))
+            except Stuck:
+                raise
+            except (DeviceTimeout, DeviceGarbled) as error:
+                return mismatch(loaded, frames, began_ns) or str(error)
+            so_far = replace(loaded, images=len(frames))
+            if problem := mismatch(so_far, frames, began_ns):
+                return problem
+            if problem := self._of_looks(frames, shot, judges):
+                return f"frame {len(frames) - 1} of the sequence: {problem}"
+        return ""
+
+    def _of_looks(self, frames: Sequence[Frame], shot: _Shot, judges: Proof | None) -> str:
+        """Why the last of the frames does not look like what was shown for it; "" if it does."""
+        if len(frames) == GUARDS:
+            white, black = (frame.pixels for frame in frames)
+            return head_problem(white, black, self._its.info.pixel_format.full_scale)
+        if len(frames) < GUARDS or judges is None:
+            return ""
+        return judges.problem(frames[-1].pixels, shot.step, shot.drawing.look)
+
+    def _one_more(self, grab: Future[Frame], wait_s: float, frames: list[Frame]) -> str:
+        """After the last frame none may come."""
+        try:
+            frames.append(self._wait(grab, wait_s))
+        except Stuck:
+            raise
+        except DeviceTimeout:
+            return ""
+        except DeviceGarbled as error:
+            return str(error)
+        return "a frame came after the last one: a false trigger"
+
+    def _wait(self, grab: Future[Frame], wait_s: float) -> Frame:
+        """Wait for a frame, and for a pause. Raises _CalledOff, and what the grab does."""
+        its = self._its
+        its.may_go_on()
+        due = time.monotonic() + wait_s + CALL_S
+        while not grab.done() and time.monotonic() < due:
+            if its.control.paused:
+                raise _CalledOff
+            wait_for([grab], _LOOK_S)
+        return its.camera.wait(grab, 0.0)
+
+    def _call_off(self, grabs: Sequence[Future[Frame]], off: threading.Event) -> None:
+        """No more pulses, no more grabs, the camera stopped. What fails here fails again, and is
+        raised, when the sequence is repeated."""
+        its = self._its
+        off.set()
+        if its.session.ended.is_set():
+            return  # whoever revoked it has halted the devices and made them safe
+        try:
+            self._projector.call(lambda p: p.stop(), SHOW_S, its.session)
+            if not all(grab.done() for grab in grabs):
+                its.camera.device.halt()
+            wait_for(grabs, CALL_S)
+            its.stop()
+        except DeviceError as error:
+            log.warning("the sequence did not end as it should", problem=str(error))
+
+    def _nothing_came(self, loaded: LoadedSequence) -> DeviceError:
+        return DeviceTimeout(
+            self._its.camera.device.name,
+            "grab",
+            f"no frame came for any of {loaded.images} trigger pulses",
+            "check the cable from the projector's trigger output, and trigger_line and "
+            "trigger_edge in rig.toml; or take mode software",
+        )

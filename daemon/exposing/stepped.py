@@ -1,0 +1,164 @@
+"""Software mode: show, trigger, and the next pattern while the last frame is read out.
+
+For a pattern step the light is first this pattern's (`show` returns at that moment), then the
+camera is triggered; the next pattern is drawn while the exposure lasts and flipped as soon as it
+ends, so that readout and flip go on side by side:
+
+    projector   |flip k|..........|flip k+1|..........
+    camera             |expose k| readout k |expose k+1|
+
+For the exposures of a bracket the light stays.
+
+A frame counts only if its exposure lies wholly within the time in which its pattern was lit, by
+the device's own time stamps, and if it looks like its pattern (`daemon.proof`). Repeating is safe
+because a frame that is not recorded has no effect. Photographs are taken in the same way, by a
+camera that needs no light.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+
+import structlog
+
+from daemon.devicethread import Stuck
+from daemon.exposing.apparatus import CALL_S, Apparatus, Lit
+from daemon.exposing.exposer import Exposer
+from daemon.ring import Buffer
+from daemon.scans.method import Expose
+from drivers.base import Acquisition, DeviceGarbled, DeviceTimeout, Frame
+from drivers.clock import NS
+
+WAY = "software"
+
+log = structlog.get_logger(__name__)
+
+
+@dataclass(slots=True)
+class _Exposure:
+    """A frame that has been triggered and is being read out."""
+
+    index: int
+    step: Expose
+    sub: int
+    lit: Lit
+    dark_ns: int  # until when the light was the pattern's; 0: it still is
+    end_ns: int  # when the camera said that the exposure would end
+    buffer: Buffer
+    grab: Future[Frame]
+    attempt: int
+
+
+class Stepped(Exposer):
+    """See the module."""
+
+    def __init__(self, apparatus: Apparatus) -> None:
+        self._its = apparatus
+        self._pending: _Exposure | None = None
+
+    def expose(self, index: int, step: Expose, first: int) -> tuple[int, int]:
+        """See Exposer."""
+        its = self._its
+        if first < step.frames:
+            if its.needs_exposure(step.exposure_us):
+                self.settle()  # what is being read out was exposed as before
+                its.set_exposure(step.exposure_us)
+            if its.lit is not None and _next_of_bracket(its.lit.step, step):
+                its.lit = replace(its.lit, step=step)  # the light is this step's already
+            else:
+                its.acquire(Acquisition.SOFTWARE)
+                self._light(step)
+        for sub in range(first, step.frames):
+            self.settle()
+            its.checkpoint()  # the frames of a long step would fill the ring while the disk is full
+            self._pending = self._trigger(index, step, sub, attempt=1)
+            if sub + 1 == step.frames:
+                its.draw_ahead(index + 1)
+            self._await_exposure(self._pending)
+        return index + 1, 0
+
+    def _light(self, step: Expose) -> Lit:
+        if self._pending is not None:
+            self._pending.dark_ns = self._its.clock.now_ns()
+        return self._its.light(step)
+
+    def _trigger(self, index: int, step: Expose, sub: int, attempt: int) -> _Exposure:
+        its = self._its
+        buffer = its.buffer()
+        its.acquire(Acquisition.SOFTWARE)
+        lit = its.lit
+        if lit is None or lit.step is not step:  # an earlier pattern was shown again, or a pause
+            lit = self._light(step)
+        if its.projector is not None:
+            its.clock.wait_until(lit.from_ns + round(step.delay_s * NS), its.session.ended)
+            its.session.check()
+        _, end_ns = its.camera.call(lambda c: c.trigger(), CALL_S, its.session)
+        timeout_s = its.frame_deadline()
+        grab = its.camera.submit(
+            lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, its.session
+        )
+        return _Exposure(index, step, sub, lit, 0, end_ns + its.rolling_ns, buffer, grab, attempt)
+
+    def _await_exposure(self, exposure: _Exposure) -> None:
+        """Wait for the end of the exposure, not of the readout: then the light may change."""
+        if self._its.projector is not None:
+            self._its.clock.wait_until(exposure.end_ns, self._its.session.ended)
+        self._its.session.check()
+
+    def settle(self) -> None:
+        """See the frame that is being read out to its end: recorded, repeated, or missing."""
+        its = self._its
+        while (exposure := self._pending) is not None:
+            problem: str
+            its.may_go_on()
+            try:
+                frame = its.camera.wait(exposure.grab, its.frame_deadline() + CALL_S)
+                problem = self._proof(exposure, frame)
+            except Stuck:
+                raise
+            except (DeviceTimeout, DeviceGarbled) as error:
+                problem = str(error)
+                frame = None
+            self._pending = None
+            index, step, sub = exposure.index, exposure.step, exposure.sub
+            if not problem and frame is not None:
+                lit_ns = exposure.lit.from_ns
+                its.put(index, step, sub, frame, exposure.buffer, way=WAY, lit_ns=lit_ns)
+                return
+            its.ring.give(exposure.buffer)
+            # After a doubtful frame nothing in the camera's queue can be trusted: empty it.
+            its.stop()
+            its.acquire(Acquisition.SOFTWARE)
+            if exposure.attempt < its.patience.attempts:
+                its.count("repeated")
+                log.warning(
+                    "frame exposed again",
+                    step=index,
+                    sub=sub,
+                    attempt=exposure.attempt,
+                    problem=problem,
+                )
+                self._light(step)
+                self._pending = self._trigger(index, step, sub, exposure.attempt + 1)
+                self._await_exposure(self._pending)
+            else:
+                its.miss(index, step, sub, problem)
+
+    def _proof(self, exposure: _Exposure, frame: Frame) -> str:
+        """Why the frame may show more or less than its pattern, by time stamps and looks; or ""."""
+        if frame.incomplete:
+            return "the frame is incomplete"
+        if self._its.projector is None:
+            return ""
+        lit = exposure.lit
+        problem = self._its.out_of_light(frame, lit.from_ns, exposure.dark_ns)
+        if problem or self._its.looks is None:
+            return problem
+        return self._its.looks.problem(frame.pixels, exposure.step, lit.look)
+
+
+def _next_of_bracket(lit: Expose, step: Expose) -> bool:
+    """Whether a step shows what the one before it shows, for another exposure of one bracket."""
+    same = (lit.pattern, lit.lighting, lit.index) == (step.pattern, step.lighting, step.index)
+    return same and lit.exposure != step.exposure

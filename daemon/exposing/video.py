@@ -1,0 +1,151 @@
+"""A video of an occluder scan: the camera streams while the stage moves, until there is enough."""
+
+from __future__ import annotations
+
+import numpy as np
+import structlog
+
+from daemon.devicethread import Stuck
+from daemon.exposing.apparatus import CALL_S, RING_S, Apparatus
+from daemon.exposing.exposer import Behind
+from daemon.motion import Mover
+from daemon.ring import Buffer
+from daemon.scans.method import Watch
+from drivers.base import (
+    Acquisition,
+    DeviceGarbled,
+    DeviceTimeout,
+    EndOfRecording,
+    Frame,
+)
+from drivers.clock import NS
+
+WAY = "video"
+
+_GAP = 10_000
+"""Frames that a stream may lose at once; a larger step in their numbers is garbage."""
+
+log = structlog.get_logger(__name__)
+
+
+class Video:
+    """Frames as they come; what the stream or the disk lost is an explicit missing record."""
+
+    def __init__(self, apparatus: Apparatus) -> None:
+        self._its = apparatus
+        self._silent = 0  # grabs in a row that gave nothing
+        self._last: int | None = None  # number of the last frame since the stream began
+        self._mover: Mover | None = None
+
+    def watch(self, index: int, step: Watch, first: int) -> str:
+        """Take frames from sub-index `first` on; gives the reason why the video ended, "" where it
+        is only that all frames were had.
+
+        Raises DeviceError, Revoked, Behind.
+        """
+        its = self._its
+        self._set_going(step)
+        began = its.clock.now_ns()
+        sub: int | None = first
+        try:
+            while sub is not None and (step.frames is None or sub < step.frames):
+                its.may_go_on()
+                if self._mover is not None and its.control.paused:
+                    self._mover.end()
+                if its.checkpoint():
+                    self._set_going(step)
+                if reason := self._enough((its.clock.now_ns() - began) / NS):
+                    return reason
+                sub = self._next(index, step, sub)
+        finally:
+            if self._mover is not None:
+                self._mover.end()
+        return ""
+
+    def _set_going(self, step: Watch) -> None:
+        """Lights on, the stage going, the camera streaming."""
+        its = self._its
+        for name in step.lights:
+            its.rig.lights[name].call(lambda x: x.set(True), CALL_S, its.session)
+        self._mover = None
+        if step.motion is not None and its.rig.stage is not None:
+            self._mover = Mover(
+                its.rig.stage,
+                step.motion,
+                its.session,
+                beat=its.may_go_on,
+                wake=its.camera.device.halt,
+            )
+            self._mover.begin()
+        its.acquire(Acquisition.FREE)
+        self._last = None
+
+    def _enough(self, seconds: float) -> str:
+        """Why the video ends now; "": it goes on. Raises what went wrong with the stage."""
+        if self._mover is not None:
+            self._mover.check()
+            if self._mover.over:
+                return "the stage's motion has come to its end"
+        return self._its.method.enough(self._its.recorder.summary, seconds)
+
+    def _next(self, index: int, step: Watch, sub: int) -> int | None:
+        """Take a frame or record why there is none; the next sub-index, None at the end of a
+        recording."""
+        its, info, last = self._its, self._its.info, self._last
+        buffer = its.ring.take(RING_S if info.recorded else 0.0)
+        behind = buffer is None
+        if buffer is None:
+            if info.recorded and its.control.paused:
+                return sub  # the disk is full
+            if info.recorded:
+                raise Behind
+            buffer = np.empty(info.shape, info.pixel_format.dtype)
+        try:
+            frame = self._grab(buffer)
+        except EndOfRecording:
+            its.ring.give(buffer)
+            return None
+        if frame is None:
+            if not behind:
+                its.ring.give(buffer)
+            if self._mover is not None:
+                self._mover.check()
+            return sub  # what was exposed meanwhile shows as a gap in the sequence
+        lost = 0 if last is None else max(0, frame.sequence - last - 1)
+        for _ in range(lost if step.frames is None else min(lost, step.frames - sub - 1)):
+            its.miss(index, step, sub, "lost between camera and host")
+            sub += 1
+        if behind:
+            its.miss(index, step, sub, "the recorder did not keep up")
+        else:
+            at = self._mover.position_at(frame.mid_ns) if self._mover is not None else None
+            its.put(index, step, sub, frame, buffer, way=WAY, stage_mm=at)
+        return sub + 1
+
+    def _grab(self, buffer: Buffer) -> Frame | None:
+        """The next frame of the stream; None if none came in time."""
+        its = self._its
+        timeout_s = its.frame_deadline()
+        try:
+            frame = its.camera.call(
+                lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, its.session
+            )
+        except Stuck:
+            raise
+        except (DeviceTimeout, DeviceGarbled) as error:
+            self._silent += 1
+            if self._silent >= its.patience.attempts:
+                raise
+            log.warning("no frame", problem=str(error), silent=self._silent)
+            return None
+        self._silent = 0
+        last = frame.sequence if self._last is None else self._last
+        if not 0 <= frame.sequence - last <= _GAP:
+            raise DeviceGarbled(
+                its.camera.device.name,
+                "grab",
+                f"frame number {frame.sequence} came after {self._last}",
+                "reconnect the camera",
+            )
+        self._last = frame.sequence
+        return frame
