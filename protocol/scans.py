@@ -95,9 +95,9 @@ class PatternScan(Scan, frozen=True, kw_only=True):
 
     average: Annotated[Count, Meta(description="frames averaged a pattern (the paper: 32)")] = 1
     lit_fraction: LitFraction | None = None  # None: the pattern's own
-    estimator: Annotated[Literal["auto", "maxmin", "topk", "lsq"], Meta(description=ESTIMATOR)] = (
-        "auto"
-    )
+    estimator: Annotated[
+        Literal["auto", "maxmin", "maxmin-unbiased", "topk", "lsq"], Meta(description=ESTIMATOR)
+    ] = "auto"
 
 
 class Checkerboard(PatternScan, frozen=True, kw_only=True, tag="checkerboard"):

@@ -13,8 +13,10 @@ from daemon import patterns
 from daemon.scans.method import Bench, Expose, Method, Step, Taken, Unsuitable
 from daemon.separation.estimator import Estimator, Lighting, Observation
 from daemon.separation.extremes import MaxMin
+from daemon.separation.noise import Noise
+from daemon.separation.order_estimate import KEEP, RANKS
 from daemon.separation.radiometry import Response
-from daemon.separation.topk import KEEP, TopK
+from daemon.separation.topk import TopK
 from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.scans import PatternScan, Radiometry, Reference
 
@@ -45,9 +47,23 @@ def response_of(radiometry: Radiometry, bench: Bench) -> Response:
             tone=radiometry.tone,
             saturation=radiometry.saturation,
             bayer=pixel_format.bayer,
+            noise=_noise_of(radiometry, bench, black),
         )
     except ValueError as error:
         raise Unsuitable(str(error), "$.radiometry") from error
+
+
+def _noise_of(radiometry: Radiometry, bench: Bench, black: float) -> Noise | None:
+    """As calibrated; None where it is not, or where counts are encoded, for it is of light."""
+    found = (bench.calibration or {}).get("noise")
+    if found is None or radiometry.tone != "linear":
+        return None
+    return Noise.of_read_and_shot(
+        float(found["read_counts"]),
+        float(found["counts_per_e"]),
+        black,
+        bench.camera.pixel_format.full_scale,
+    )
 
 
 def leakage_of(radiometry: Radiometry, bench: Bench) -> float:
@@ -181,28 +197,35 @@ class RankedMethod(PatternMethod[P]):
     """A set of two-valued patterns of one lit fraction, of which each pixel's brightest and darkest
     samples tell direct from global."""
 
-    estimators = ("topk", "maxmin")
+    estimators = ("topk", "maxmin", "maxmin-unbiased")
+
+    even: ClassVar[bool] = True
+    """Whether each pattern lights as much of any neighbourhood."""
 
     def weights(self) -> NDArray[np.complex128] | None:
         """What tells the pattern's place at a pixel: see `handedness.WaveSums`. None: nothing."""
         return None
 
     def ranking(self) -> Estimator:
-        """The paper's max/min where it is asked for, or where there are too few patterns to rank;
-        else topk."""
+        """What is asked for; else topk, or max/min where there are too few patterns to rank, less
+        the bias of noise where there are enough to know it."""
         name = self.spec.estimator
-        if name == "topk" and len(self._patterns) < 2 * KEEP:
+        few = len(self._patterns) < 2 * KEEP
+        if name == "topk" and few:
             raise Unsuitable(
                 f"topk ranks {2 * KEEP} patterns at least; take maxmin for {len(self._patterns)}",
                 "$.estimator",
             )
-        if name == "maxmin" or len(self._patterns) < 2 * KEEP:
+        if name.startswith("maxmin") or few:
+            known = len(self._patterns) >= 2 * RANKS
             return MaxMin(
                 self.response,
                 lit_fraction=self.lit_fraction,
                 leakage=self.leakage,
                 average=self.spec.average,
                 levels=self.levels,
+                even=self.even,
+                unbiased=name == "maxmin-unbiased" or (name == "auto" and known),
             )
         return TopK(
             self.response,
@@ -211,4 +234,5 @@ class RankedMethod(PatternMethod[P]):
             levels=self.levels,
             average=self.spec.average,
             weights=self.weights(),
+            even=self.even,
         )

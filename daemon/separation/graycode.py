@@ -128,7 +128,8 @@ class GrayCodeDecoder:
         if not self._difference:
             raise NotYet("the fine stripes of the Gray code have not come yet")
         b = self._leakage
-        deviation = self._noise.deviation(self._brightest)
+        told = self._noise.told()
+        deviation = told.deviation(self._brightest)
         contrast, stripe = self._finest(deviation)
         direct = contrast * np.float32(1.0 / (1.0 - b))
         pair = self._whole * np.float32(1.0 / self._pairs)
@@ -169,14 +170,14 @@ class GrayCodeDecoder:
                 "unused_frames": self._unused,
                 "lit_fraction": 0.5,
                 "leakage": b,
-                "noise_from": self._noise.source,
+                **told.facts(),
                 "stripes": {
                     str(width): round(float(np.mean(stripe == width)), 4)
                     for width in np.unique(stripe).tolist()
                 },
                 **self._references.facts(total.source),
                 **steady,
-                "advice": advice,
+                "advice": advice + told.advice(),
             },
         )
 

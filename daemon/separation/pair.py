@@ -62,7 +62,8 @@ class ComplementPair:
         ambient, source = self._ambient(first, second)
         lit, unlit = (first, second) if ambient is None else (first - ambient, second - ambient)
         brightest = np.maximum(first, second)
-        deviation = self._noise.deviation(brightest)
+        told = self._noise.told()
+        deviation = told.deviation(brightest)
         moved, steady, advice = compare(
             self._references, (first + second) * np.float32(0.5), deviation, self._leakage
         )
@@ -74,7 +75,7 @@ class ComplementPair:
             brightest=brightest,
             saturated=self._saturated,
             flags=moved,
-            planes=self._deviations(deviation, self._noise.deviation(np.minimum(first, second))),
+            planes=self._deviations(deviation, told.deviation(np.minimum(first, second))),
             judgement=Judgement.of_extremes(deviation, 2),
             facts={
                 "estimator": "complement pair",
@@ -82,11 +83,11 @@ class ComplementPair:
                 "unused_frames": self._unused,
                 "lit_fraction": self._alpha,
                 "leakage": self._leakage,
-                "noise_from": self._noise.source,
+                **told.facts(),
                 **self._references.facts(source),
                 **steady,
                 **self._residual(first, second),
-                "advice": advice,
+                "advice": advice + told.advice(),
             },
         )
 

@@ -7,6 +7,7 @@ comparing frames stays as fast as memory is.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -55,21 +56,77 @@ class ScanNoise:
         found = from_frame(pixels, self._response.full_scale, self._response.bayer)
         self._picture = found if self._picture is None else self._picture.bounded_by(found)
 
+    def told(self, ranks: Noise | None = None) -> Told:
+        """What is known by now; `ranks`: the noise of one frame that explains how far apart the
+        ranks of samples are, for which a picture is no match.
+
+        A calibration is believed unless the scan's own frames contradict it: repeats either way,
+        else a picture and ranks together (each may hold more than noise) or a picture with less.
+        """
+        repeats, calibrated = self._repeats.noise(), self._response.noise
+        own, source = (
+            (repeats, REPEATS) if repeats else (ranks, RANKS) if ranks else (self._picture, PICTURE)
+        )
+        if calibrated is None:
+            return Told(self._response, own, self._average, source)
+        own_bounds = [repeats] if repeats else [self._picture, ranks]
+        found = [one.over(calibrated) for one in own_bounds if one]
+        ratio = min(found, default=1.0)
+        slack = _SURE if repeats else _UNSURE
+        excess = ratio > slack and (repeats is not None or ranks is not None)
+        if excess or ratio < 1.0 / slack:
+            return Told(self._response, own, self._average, source, ratio)
+        return Told(self._response, calibrated, self._average, CALIBRATION, ratio)
+
+
+REPEATS, RANKS, PICTURE = "repeated frames", "ranks", "one picture"
+RESIDUALS, CALIBRATION = "residuals of the fit", "calibration"
+
+_SURE, _UNSURE = 1.25, 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What is known of the noise of a pattern's averaged frames, and from what.
+
+    `noise` is that of one frame's counts (None: rounding alone); `agreement` the scan's own figure
+    over the calibrated one (None: none is applied).
+    """
+
+    response: Response
+    noise: Noise | None
+    average: int
+    source: str
+    agreement: float | None = None
+
     @property
     def measured(self) -> bool:
         """Whether it is measured, not an upper bound."""
-        return self._repeats.pairs > 0
-
-    @property
-    def source(self) -> str:
-        """From what the noise is known."""
-        return "repeated frames" if self.measured else "one picture"
+        return self.source != PICTURE
 
     def deviation(self, light: Plane) -> Plane:
         """Standard deviation of a pattern's averaged linear light at a level of it (float32)."""
-        noise = self._repeats.noise() or self._picture
-        one = self._response.deviation(noise, self._response.counts(light))
-        return one * np.float32(self._average**-0.5)
+        one = self.response.deviation(self.noise, self.response.counts(light))
+        if self.average > 1:
+            one *= np.float32(self.average**-0.5)
+        return one
+
+    def facts(self) -> dict[str, Any]:
+        """For quality.json."""
+        facts: dict[str, Any] = {"noise_from": self.source}
+        if self.agreement is not None:
+            facts["noise_of_calibrated"] = round(self.agreement, 3)
+        return facts
+
+    def advice(self) -> list[str]:
+        """A line where the calibration is contradicted."""
+        if self.agreement is None or self.source == CALIBRATION:
+            return []
+        return [
+            f"the frames have {self.agreement:.2g} times the calibrated noise, which is therefore "
+            "not used: run `umbra calibrate noise` again with these camera settings; if it stays, "
+            "light flickers or something moved"
+        ]
 
 
 class ResidualNoise:
