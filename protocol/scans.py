@@ -35,7 +35,10 @@ Seed = Annotated[int, Meta(ge=0, le=2**53, description="of the random numbers")]
 SUN_DEG = 0.53  # angular diameter
 AXIS = "axis along which the pattern varies: x makes vertical stripes"
 LEAKAGE = "brightness b of an unlit source element as a fraction of a lit one"
-ESTIMATOR = "how frames become components; maxmin is the paper's, auto the best for the method"
+ESTIMATOR = (
+    "how frames become components; maxmin is the paper's, maxmin-unbiased the same less what noise "
+    "and blur do to it, auto the best for the method"
+)
 
 
 class Reference(enum.StrEnum):

@@ -15,7 +15,7 @@ from daemon.separation.noise import Noise
 from daemon.separation.order import Ranked
 from daemon.separation.order_model import BLURS, RATIOS, OrderErrors, fit, simulate
 from daemon.separation.radiometry import Plane, Response
-from daemon.separation.scan_noise import ScanNoise, Told
+from daemon.separation.scan_noise import CALIBRATION, ScanNoise, Told
 
 KEEP = 5
 """Samples kept at each end; a checkerboard's 25 shifts light every pixel wholly in 9 or more."""
@@ -74,40 +74,61 @@ class OrderStatistics:
     ) -> Explained:
         """The blur and the noise that explain how far apart ranks are: `low` and `high` are light,
         (keep, places), the most extreme first."""
-        told = noise.told()
-        if self.keep < RANKS:
-            return Explained(self._models[0], None, told)
-        two = min(2, self.keep)
-        step = high[:two].mean(axis=0) - low[:two].mean(axis=0)
-        middle = (high[0] + low[0]) * np.float32(0.5)
-        lit = step > np.quantile(step, 0.1)
-        order = np.argsort(step[lit], kind="stable")  # alike in noise over step
-        groups = np.array_split(np.flatnonzero(lit)[order], _GROUPS)
-        groups = [group for group in groups if group.size >= _LEAST]
-        if not groups:
-            return Explained(self._models[0], None, told)
-        apart = np.stack([high[:1] - high[1:], low[1:] - low[:1]])
-        steps = np.array([float(step[g].mean()) for g in groups])
-        steps = np.maximum(steps, 1e-6)
-        gaps = np.stack([apart[:, :, g].mean(axis=2) for g in groups]) / steps[:, None, None]
-        light = np.stack([[np.median(end[g]) for end in (high[1], low[1])] for g in groups])
+        groups = None if self.keep < RANKS else _grouped(low, high)
+        if groups is None:
+            return Explained(self._models[0], None, noise.told())
+        own = noise.own()
+        found, sigma = self._fitted(groups, own)
+        ranks = None if own.measured else _by_level(response, groups.light, sigma * average**0.5)
+        told = noise.told(ranks)
+        if told.source == CALIBRATION:
+            found, _ = self._fitted(groups, told)
+        blur, uneven = found
+        return Explained(self._models[blur], BLURS[blur], told, uneven)
+
+    def _fitted(self, of: _Groups, told: Told) -> tuple[tuple[int, float], NDArray[np.float64]]:
+        """The blur (an index of BLURS) and how many times its noise the samples differ by; the
+        noise of each group."""
         if told.measured:
-            kinds = told.deviation(light.astype(np.float32))[None].astype(np.float64)
+            kinds = told.deviation(of.light.astype(np.float32))[None].astype(np.float64)
         else:  # as much as in the picture, but of any share of shot noise
-            between = np.maximum([np.median(middle[g]) for g in groups], 1e-6)
-            typical = float(np.median(told.deviation(between.astype(np.float32))))
-            grown = np.maximum(light, 0.0) / np.median(between)
+            typical = float(np.median(told.deviation(of.middle)))
+            grown = np.maximum(of.light, 0.0) / max(float(np.median(of.middle)), 1e-6)
             kinds = np.stack([typical * np.sqrt(1.0 - shot + shot * grown) for shot in _SHOT])
+        relative = np.maximum(kinds, 1e-3) / of.steps[:, None]
         blur, _, kind, amount = fit(
-            self._models, gaps.astype(np.float64), np.maximum(kinds, 1e-3) / steps[:, None],
-            known=told.measured, even=self._even,
-        )  # fmt: skip
+            self._models, of.gaps, relative, known=told.measured, even=self._even
+        )
         # what more there is where patterns are uneven is global light, the same in a repeated scan
         uneven = 1.0 if self._even else max(amount, 1.0)
-        if not told.measured or told.agreement is not None:
-            sigma = kinds[kind] * (amount / uneven) * average**0.5
-            told = noise.told(_by_level(response, light, sigma))
-        return Explained(self._models[blur], BLURS[blur], told, uneven)
+        return (blur, uneven), kinds[kind] * (amount / uneven)
+
+
+@dataclass(frozen=True, slots=True)
+class _Groups:
+    """Pixels alike in step: the mean distances of their ranks (groups, 2, keep - 1) by the raw step
+    (groups); light of lit and unlit samples (groups, 2), and half-way between."""
+
+    gaps: NDArray[np.float64]
+    steps: NDArray[np.float64]
+    light: NDArray[np.float64]
+    middle: Plane
+
+
+def _grouped(low: Plane, high: Plane) -> _Groups | None:
+    """Groups of the pixels whose ranks (keep, places) these are; None of too few."""
+    step = high[:2].mean(axis=0) - low[:2].mean(axis=0)
+    lit = np.flatnonzero(step > np.quantile(step, 0.1))
+    groups = np.array_split(lit[np.argsort(step[lit], kind="stable")], _GROUPS)
+    groups = [group for group in groups if group.size >= _LEAST]
+    if not groups:
+        return None
+    apart = np.stack([high[:1] - high[1:], low[1:] - low[:1]])
+    steps = np.maximum([float(step[g].mean()) for g in groups], 1e-6)
+    gaps = np.stack([apart[:, :, g].mean(axis=2) for g in groups]) / steps[:, None, None]
+    light = np.stack([[np.median(end[g]) for end in (high[1], low[1])] for g in groups])
+    middle = np.asarray(light.mean(axis=1), dtype=np.float32)
+    return _Groups(gaps.astype(np.float64), steps, light.astype(np.float64), middle)
 
 
 _LOG = np.log(RATIOS)

@@ -56,6 +56,12 @@ class ScanNoise:
         found = from_frame(pixels, self._response.full_scale, self._response.bayer)
         self._picture = found if self._picture is None else self._picture.bounded_by(found)
 
+    def own(self) -> Told:
+        """What the scan's frames alone say."""
+        repeats = self._repeats.noise()
+        source = PICTURE if repeats is None else REPEATS
+        return Told(self._response, repeats or self._picture, self._average, source)
+
     def told(self, ranks: Noise | None = None) -> Told:
         """What is known by now; `ranks`: the noise of one frame that explains how far apart the
         ranks of samples are, for which a picture is no match.
@@ -63,20 +69,13 @@ class ScanNoise:
         A calibration is believed unless the scan's own frames contradict it: repeats either way,
         else a picture and ranks together (each may hold more than noise) or a picture with less.
         """
-        repeats, calibrated = self._repeats.noise(), self._response.noise
-        own, source = (
-            (repeats, REPEATS) if repeats else (ranks, RANKS) if ranks else (self._picture, PICTURE)
-        )
-        if calibrated is None:
-            return Told(self._response, own, self._average, source)
-        own_bounds = [repeats] if repeats else [self._picture, ranks]
-        found = [one.over(calibrated) for one in own_bounds if one]
-        ratio = min(found, default=1.0)
-        slack = _SURE if repeats else _UNSURE
-        excess = ratio > slack and (repeats is not None or ranks is not None)
-        if excess or ratio < 1.0 / slack:
-            return Told(self._response, own, self._average, source, ratio)
-        return Told(self._response, calibrated, self._average, CALIBRATION, ratio)
+        repeats = self._repeats.noise()
+        if repeats is not None:
+            return told(self._response, repeats, REPEATS, [repeats], self._average, sure=True)
+        bounds = [bound for bound in (self._picture, ranks) if bound is not None]
+        if ranks is not None:
+            return told(self._response, ranks, RANKS, bounds, self._average)
+        return told(self._response, self._picture, PICTURE, bounds, self._average)
 
 
 REPEATS, RANKS, PICTURE = "repeated frames", "ranks", "one picture"
@@ -129,6 +128,31 @@ class Told:
         ]
 
 
+def told(
+    response: Response,
+    own: Noise | None,
+    source: str,
+    bounds: list[Noise],
+    average: int = 1,
+    *,
+    sure: bool = False,
+) -> Told:
+    """The calibrated noise unless the scan's own contradicts it, else the latter.
+
+    `bounds` are what the scan's frames say, each the noise or more; a picture alone is no proof of
+    more, for texture looks like noise. `sure`: they are the noise.
+    """
+    calibrated = response.noise
+    if calibrated is None:
+        return Told(response, own, average, source)
+    ratio = min((bound.over(calibrated) for bound in bounds), default=1.0)
+    slack = _SURE if sure else _UNSURE
+    more = ratio > slack and source != PICTURE
+    if more or ratio < 1.0 / slack:
+        return Told(response, own, average, source, ratio)
+    return Told(response, calibrated, average, CALIBRATION, ratio)
+
+
 class ResidualNoise:
     """Noise from what a fit of M + B sin(φ + δ) leaves, on every fourth row and column.
 
@@ -147,15 +171,13 @@ class ResidualNoise:
         residuals = self._frequencies.setdefault(frequency, _Residuals())
         residuals.add(light[::_SAMPLE, ::_SAMPLE], delta)
 
-    @property
-    def source(self) -> str:
-        """From what the noise is known."""
-        return "residuals of the fit" if self.measured else "one picture"
-
-    @property
-    def measured(self) -> bool:
-        """Whether it is measured, not an upper bound."""
-        return self._fitted() is not None
+    def told(self) -> Told:
+        """What is known by now of one frame's noise: see `ScanNoise`."""
+        fitted = self._fitted()
+        if fitted is not None:
+            return told(self._response, fitted, RESIDUALS, [fitted], sure=True)
+        bounds = [] if self._picture is None else [self._picture]
+        return told(self._response, self._picture, PICTURE, bounds)
 
     @property
     def misfit(self) -> float | None:
@@ -170,10 +192,6 @@ class ResidualNoise:
         """What the fit leaves over the wave's amplitude, where that is large: the median."""
         found = [r.distortion() for r in self._frequencies.values() if r.freedom > 0]
         return max(found) if found else None
-
-    def noise(self) -> Noise | None:
-        """Deviation of one frame's counts by level."""
-        return self._fitted() or self._picture
 
     def _fitted(self) -> Noise | None:
         found = [r.variance() for r in self._frequencies.values() if r.freedom > 0]

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation
 from daemon.separation.finish import Judgement, finish
-from daemon.separation.noise import from_frame
+from daemon.separation.noise import Noise, from_frame
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
+from daemon.separation.scan_noise import PICTURE, Told, told
 
 _PEAK = 0.82 * 0.9
 """Deviation of a row's peaks in a square over a pixel's: a peak is the larger of two pixels as
@@ -104,8 +105,9 @@ class PeaksAndValleys:
             lit, unlit = lit - ambient, unlit - ambient
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
         saturated = self._reduced(self._saturated.astype(np.float32)) > 0
-        deviation = self._deviation(picture, brightest)
-        planes = self._stated(deviation, self._deviation(picture, darkest))
+        noise = self._noise(picture)
+        deviation = noise.deviation(brightest)
+        planes = self._stated(deviation, noise.deviation(darkest))
         plain = Response(
             self._response.full_scale,
             self._response.black,
@@ -127,8 +129,9 @@ class PeaksAndValleys:
                 "lit_fraction": self._alpha,
                 "leakage": self._leakage,
                 "reduced_by": self._reduce,
-                "noise_from": "one picture",
+                **noise.facts(),
                 **self._references.facts(source),
+                "advice": noise.advice(),
             },
         )
 
@@ -157,10 +160,12 @@ class PeaksAndValleys:
             "global_std": np.sqrt(of_dark + of_lit) * np.float32(1.0 / ((1.0 - b) * g)),
         }
 
-    def _deviation(self, picture: Plane, brightest: Plane) -> Plane:
+    def _noise(self, picture: Plane) -> Told:
+        """That of one of the frames that were averaged."""
         counts = self._response.counts(picture)
-        noise = from_frame(counts, self._response.full_scale, self._response.bayer)
-        return self._response.deviation(noise, self._response.counts(brightest))
+        mean = from_frame(counts, self._response.full_scale, self._response.bayer)
+        shown = Noise(mean.levels, tuple(d * self._frames**0.5 for d in mean.deviations))
+        return told(self._response, shown, PICTURE, [shown])
 
     def _extremes(self, picture: Plane) -> tuple[Plane, Plane]:
         """L_max and L_min at the lower resolution, RGB for a mosaic."""

@@ -18,10 +18,9 @@ from daemon.separation import correspondence
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import reversed_pattern, strength
-from daemon.separation.noise import Noise
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
-from daemon.separation.scan_noise import ResidualNoise
+from daemon.separation.scan_noise import ResidualNoise, Told
 from daemon.separation.steadiness import compare
 
 _LEAST_ECCENTRIC = 0.02
@@ -96,7 +95,7 @@ class LeastSquares:
         ready = [fit for fit in self._fits if fit.solvable]
         if not ready or self._saturated is None:
             raise NotYet("a sinusoid needs 3 phases; they have not all come yet")
-        noise = self._noise.noise()
+        noise = self._noise.told()
         blur = self._blur(ready)
         solved = [
             self._separate(fit, noise, gain)
@@ -130,14 +129,16 @@ class LeastSquares:
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
-            "noise_from": self._noise.source,
+            **noise.facts(),
             **self._references.facts(
                 self._references.total(ready[0].solve()[0], self._leakage).source
             ),
             "mirrors_looked_for": bool(self._periods),
             **steady,
             "misfit": None if misfit is None else round(misfit, 3),
-            "advice": _advice(misfit, self._noise.distortion, disagreeing) + advice,
+            "advice": _advice(misfit, self._noise.distortion, disagreeing)
+            + advice
+            + noise.advice(),
         }
         return finish(
             direct,
@@ -197,16 +198,14 @@ class LeastSquares:
             return [1.0] * count
         return [float(g) for g in np.exp(2.0 * np.pi**2 * blur**2 * self._squared_frequencies())]
 
-    def _separate(
-        self, fit: _Fit, noise: Noise | None, gain: float
-    ) -> tuple[Plane, Plane, Plane, Plane]:
+    def _separate(self, fit: _Fit, noise: Told, gain: float) -> tuple[Plane, Plane, Plane, Plane]:
         """Direct, global and their variances from one frequency."""
         mean, cosine, sine = fit.solve()
         b = self._leakage
-        sigma = self._response.deviation(noise, self._response.counts(mean))
+        sigma = noise.deviation(mean)
         mean_var, wave_var = fit.variances()
         power = cosine * cosine + sine * sine
-        if self._noise.measured:
+        if noise.measured:
             # |B| of noise alone is not 0: to first order its square is too large by one variance.
             power = np.maximum(power - np.float32(wave_var) * sigma * sigma, 0)
         amplitude: Plane = np.sqrt(power)
@@ -219,7 +218,7 @@ class LeastSquares:
         total_var: Plane = variance * of_total
         return direct, indirect, direct_var, direct_var + total_var
 
-    def _mirrored(self, fit: _Fit, noise: Noise | None) -> NDArray[np.bool_]:
+    def _mirrored(self, fit: _Fit, noise: Told) -> NDArray[np.bool_]:
         """Where the phase runs against the picture's."""
         _, cosine, sine = fit.solve()
         wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
@@ -228,9 +227,9 @@ class LeastSquares:
         deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
         return reversed_pattern([wave], strength([wave], deviation))
 
-    def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
+    def _level(self, fit: _Fit, noise: Told) -> Plane:
         mean, _, _ = fit.solve()
-        return self._response.deviation(noise, self._response.counts(mean))
+        return noise.deviation(mean)
 
     def _correspondence(self, ready: list[_Fit]) -> dict[str, NDArray[Any]]:
         """Wrapped phase of the first frequency, and where the projector lit each pixel."""

@@ -161,7 +161,7 @@ class TopK:
             judgement=Judgement(
                 direct=np.float32(SIGNIFICANT) * np.maximum(planes["direct_std"], rounding),
                 total=np.float32(SIGNIFICANT) * np.maximum(planes["global_std"], rounding),
-                deviation=deviation,
+                deviation=deviation * np.float32(1.0 / uneven),
             ),
             planes=planes,
             facts={
