@@ -35,11 +35,11 @@ _FINE = np.linspace(np.log(RATIOS[0]), np.log(RATIOS[-1]), 240)
 _AMOUNTS = np.geomspace(1 / 30, 30, 172)  # 1 is not among them
 _KNOWN = 1.0  # relative misfit that a factor e between fitted and known noise costs
 _ABOVE = 0.1  # ... that a picture shows, which has at least its noise
-_UNEVEN = 0.003  # ... where patterns light a neighbourhood differently: global light adds to it
+_UNEVEN = 0.02  # ... either way, where patterns light a neighbourhood differently
 _BELOW = 0.004  # ... at most, for texture in the picture may be the reason, ...
 _TEXTURE = 0.2  # ... and half of that at this logarithm
 _ALIKE = 0.1  # blurs whose cost differs by so much of the least explain about as well
-_SHARP = 1.55  # times the least cost, where light is uneven, a sharp pattern explains as well
+_LOUD = 0.04  # noise over the step below which blur shows, and a picture matters less
 _DOUBT = 0.5  # a bias that is corrected still costs this part of it: blur differs over a scene
 
 
@@ -148,9 +148,10 @@ def fit(
     size = (gaps**2).sum(axis=(1, 2))  # misfits are relative to it, for each group to have its say
     log = np.log(RATIOS)
     away = np.log(_AMOUNTS)
-    texture = _BELOW / (1.0 + np.square(_TEXTURE / away))
+    loud = min(float(np.median(noise)) / _LOUD, 1.0)
+    texture = _BELOW * loud / (1.0 + np.square(_TEXTURE / away))
     below, above = (_KNOWN * away**2,) * 2 if known else (texture, _ABOVE * away**2)
-    prior = noise[0].size * np.where(away > 0, above if even else _UNEVEN * away**2, below)
+    prior = np.where(away > 0, above, below) if even else _UNEVEN * away**2
     wanted = np.log(noise)[:, None] + away[:, None, None]  # (kinds, amounts, groups, 2)
     group, end = np.indices(noise.shape[1:])
     costs = np.empty(len(models))
@@ -162,14 +163,20 @@ def fit(
         misfit = ((gaps[:, None] - table[None]) ** 2).sum(axis=3) / size[:, None, None]
         raw = _FINE - np.log(np.interp(_FINE, log, model.step))
         place = np.interp(wanted, raw, np.arange(raw.size))
-        cost = misfit[group, np.rint(place).astype(np.intp), end].sum(axis=(2, 3)) + prior
-        kind, amount = (int(n) for n in np.unravel_index(int(np.argmin(cost)), cost.shape))
-        costs[index] = cost[kind, amount]
+        cost = misfit[group, np.rint(place).astype(np.intp), end].sum(axis=3)
+        cost += 2.0 * prior[:, None]  # (kinds, amounts, groups)
+        if even:
+            kind, amount = (
+                int(n) for n in np.unravel_index(int(np.argmin(cost.sum(axis=2))), cost.shape[:2])
+            )
+            costs[index] = cost[kind, amount].sum()
+        else:  # what global light adds differs from group to group
+            kind = int(np.argmin(cost.min(axis=1).sum(axis=1)))
+            costs[index] = cost[kind].min(axis=0).sum()
+            amount = int(np.median(np.argmin(cost[kind], axis=0)))
         ratios = np.exp(np.interp(place[kind, amount], np.arange(raw.size), _FINE))
         found.append((ratios, kind, float(_AMOUNTS[amount])))
     # of blurs that explain it about as well the mean: none of them is far from it
     weight = np.exp((costs.min() - costs) / (_ALIKE * costs.min() + 1e-9))
     blur = round(float(weight @ np.arange(costs.size) / weight.sum()))
-    if not even and costs[0] <= _SHARP * costs.min():
-        blur = 0  # uneven light looks like a little blur
     return blur, *found[blur]

@@ -114,7 +114,8 @@ class TopK:
         if patterns < 2:
             raise NotYet(f"ranking needs 2 patterns, {patterns} came so far")
         low, high = self._light(self._low.planes), self._light(self._high.planes)
-        ends, told, uneven, unlit_deviation, deviation, found = self._ends(low, high)
+        ends, told, uneven, unlit_deviation, lit_deviation, found = self._ends(low, high)
+        deviation = np.hypot(unlit_deviation, lit_deviation) * np.float32(0.5**0.5)
         lit, unlit = ends.lit, ends.unlit
         rounding = self._response.deviation(None, self._response.counts(high[0]))
         b = self._leakage

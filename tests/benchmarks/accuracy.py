@@ -42,6 +42,11 @@ def _specs() -> list[tuple[str, int, AnyScan]]:
     light = Radiometry(leakage=LEAKAGE)
     return [
         ("checkerboard maxmin", 25, Checkerboard(estimator="maxmin", radiometry=light)),
+        (
+            "checkerboard maxmin-unbiased",
+            25,
+            Checkerboard(estimator="maxmin-unbiased", radiometry=light),
+        ),
         ("checkerboard topk", 25, Checkerboard(estimator="topk", radiometry=light)),
         ("two-image", 2, TwoImage(radiometry=light)),
         ("sinusoid N = 3", 3, Sinusoid(phases=3, radiometry=light)),
@@ -102,7 +107,11 @@ def run() -> list[Ratio]:
     found = {(row.name, row.sigma): row for row in rows()}
     ratios = []
     for (name, sigma), row in found.items():
-        unbiased = name in {"checkerboard topk", "random-binary topk"}
+        unbiased = name in {
+            "checkerboard maxmin-unbiased",
+            "checkerboard topk",
+            "random-binary topk",
+        }
         ratios.append(
             Ratio(
                 name=f"accuracy, {name}, σ {sigma:g}",
