@@ -79,6 +79,10 @@ class OrderStatistics:
             return Explained(self._models[0], None, noise.told())
         own = noise.own()
         found, sigma = self._fitted(groups, own)
+        if not own.measured:  # light that differs from pattern to pattern is in ranks, not in it
+            pictured = own.deviation(groups.light.astype(np.float32))
+            whole = groups.light > _CLIPPED * sigma
+            sigma = np.where(whole, np.minimum(sigma, pictured), sigma)
         ranks = None if own.measured else _by_level(response, groups.light, sigma * average**0.5)
         told = noise.told(ranks)
         if told.source == CALIBRATION:
@@ -132,6 +136,7 @@ def _grouped(low: Plane, high: Plane) -> _Groups | None:
 
 
 _LOG = np.log(RATIOS)
+_CLIPPED = 4.0  # deviations above black from which a picture has all of its noise
 _SHOT = (0.0, 0.3, 0.6, 0.9, 1.0)  # shares of shot noise in the variance at the typical light
 
 

@@ -107,11 +107,7 @@ def run() -> list[Ratio]:
     found = {(row.name, row.sigma): row for row in rows()}
     ratios = []
     for (name, sigma), row in found.items():
-        unbiased = name in {
-            "checkerboard maxmin-unbiased",
-            "checkerboard topk",
-            "random-binary topk",
-        }
+        unbiased = name in {"checkerboard topk", "random-binary topk"}
         ratios.append(
             Ratio(
                 name=f"accuracy, {name}, σ {sigma:g}",
