@@ -237,6 +237,10 @@ class Course:
             scanning = self._rig.clock.now_ns()
             try:
                 self._sequence(session, method, recorder, ring, choice, (step, sub))
+            except BaseException:
+                # Now, for the recorder may wait long for room.
+                self._rig.make_safe(halt=not session.ended.is_set())
+                raise
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.
                 try:
