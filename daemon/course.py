@@ -166,6 +166,7 @@ class Course:
             control=self.control,
             viewfinder=self._viewfinder,
             on_wait=self._wait,
+            on_look=self._look,
             beat=self._alive,
         )
         try:
@@ -237,6 +238,10 @@ class Course:
             scanning = self._rig.clock.now_ns()
             try:
                 self._sequence(session, method, recorder, ring, choice, (step, sub))
+            except BaseException:
+                # Now, for the recorder may wait long for room.
+                self._rig.make_safe(halt=not session.ended.is_set())
+                raise
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.
                 try:
@@ -327,6 +332,11 @@ class Course:
             self._note(RunState.WAITING)
         self._say(f"waiting for {waits.what}: {waits.seen}")
 
+    def _look(self, exposure_s: float) -> None:
+        """A picture is taken before the first frame: a sign of life, and how long the next may take
+        to come."""
+        self.beat, self._exposure_s = time.monotonic(), exposure_s
+
     def _note(self, state: RunState) -> None:
         """Another state, which a full disk must not keep the run from: it is written later
         (`Runner.tend`)."""
@@ -394,6 +404,7 @@ class Course:
         self.beat = time.monotonic()
         if self.folder.file.state is RunState.PAUSED and not self.control.paused:
             self._update(state=RunState.RUNNING)  # it was resumed while it was being paused
+            self._say("scanning")
         if self.beat - self._room_seen < _ROOM_S:
             return
         self._room_seen = self.beat

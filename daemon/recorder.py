@@ -115,6 +115,7 @@ class Recorder:
         self._handed = 0  # frames put by the sequencer, and of these ...
         self._taken_in = 0  # ... in the estimator
         self._changed = threading.Condition()
+        self._concluding = threading.Lock()  # once the separator has ended anybody may ask
         self._missing_patterns: set[int] = set()
         self._seen_patterns: set[int] = set()
         self._incoming: queue.Queue[Exposed | None] = queue.Queue(maxsize=ring.count + 1)
@@ -221,9 +222,13 @@ class Recorder:
 
     def result(self, timeout_s: float) -> Result:
         """The result from the frames taken in so far; from any thread. Raises NotYet."""
-        if not self._threads[1].is_alive():
+        separator = self._threads[1]
+        if separator.ident is None:
+            raise NotYet("what was recorded before the interruption is being taken in; ask again")
+        if not separator.is_alive():
             self.check()
-            return self._conclude()
+            with self._concluding:
+                return self._conclude()
         future: Future[Result] = Future()
         try:
             self._accepted.put(future, timeout=timeout_s)

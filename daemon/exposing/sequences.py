@@ -31,7 +31,7 @@ import structlog
 from numpy.typing import NDArray
 
 from daemon.devicethread import Stuck
-from daemon.exposing.apparatus import CALL_S, SHOW_S, Apparatus, Drawing
+from daemon.exposing.apparatus import CALL_S, LOOK_S, SHOW_S, Apparatus, Drawing
 from daemon.exposing.exposer import Exposer
 from daemon.exposing.modes import GUARDS, Pace, pace
 from daemon.proof import Proof, head_problem
@@ -58,7 +58,6 @@ IMAGES_BYTES = 256 << 20
 _LOAD_S = 30.0
 _START_S = 1.0  # from `run` to the first pulse, beyond a frame's own deadline
 _BEYOND = 1.5  # periods after the last frame in which none may come
-_LOOK_S = 0.05  # how often a pause is looked for while a frame is waited for
 
 log = structlog.get_logger(__name__)
 
@@ -362,24 +361,31 @@ class Sequences(Exposer):
         while not grab.done() and time.monotonic() < due:
             if its.control.paused:
                 raise _CalledOff
-            wait_for([grab], _LOOK_S)
+            wait_for([grab], LOOK_S)
         return its.camera.wait(grab, 0.0)
 
     def _call_off(self, grabs: Sequence[Future[Frame]], off: threading.Event) -> None:
-        """No more pulses, no more grabs, the camera stopped. What fails here fails again, and is
-        raised, when the sequence is repeated."""
+        """No more pulses, no more grabs, the camera stopped, each whether the other could be ended
+        or not. A device that is gone is met again, and raised, when the sequence is repeated."""
         its = self._its
         off.set()
         if its.session.ended.is_set():
             return  # whoever revoked it has halted the devices and made them safe
-        try:
-            self._projector.call(lambda p: p.stop(), SHOW_S, its.session)
-            if not all(grab.done() for grab in grabs):
-                its.camera.device.halt()
-            wait_for(grabs, CALL_S)
-            its.stop()
-        except DeviceError as error:
-            log.warning("the sequence did not end as it should", problem=str(error))
+        for end in (self._end_pulses, lambda: self._end_grabs(grabs)):
+            try:
+                end()
+            except DeviceError as error:
+                log.warning("the sequence did not end as it should", problem=str(error))
+
+    def _end_pulses(self) -> None:
+        self._projector.call(lambda p: p.stop(), SHOW_S, self._its.session)
+
+    def _end_grabs(self, grabs: Sequence[Future[Frame]]) -> None:
+        its = self._its
+        if not all(grab.done() for grab in grabs):
+            its.camera.device.halt()
+        wait_for(grabs, CALL_S)
+        its.stop()
 
     def _nothing_came(self, loaded: LoadedSequence) -> DeviceError:
         return DeviceTimeout(
