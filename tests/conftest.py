@@ -1,4 +1,4 @@
-"""The whole suite's surroundings: the same from a terminal, in the background and on a busy host."""
+"""The surroundings of all tests: the same from a terminal, in the background, on a busy host."""
 
 from __future__ import annotations
 
