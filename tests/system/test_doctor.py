@@ -94,7 +94,7 @@ def test_the_command_line(daemon: Daemon) -> None:
     def doctor(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, "-m", "protocol.cli", "doctor", "--rig", daemon.endpoint, *arguments],
-            capture_output=True, text=True, timeout=50, check=False,
+            capture_output=True, text=True, timeout=100, check=False,
         )  # fmt: skip
 
     with daemon.start():

@@ -115,7 +115,7 @@ def test_the_command_line(daemon: Daemon, tmp_path: Path) -> None:
         return subprocess.run(
             [sys.executable, "-m", "protocol.cli", "preview", "--rig", daemon.endpoint, "--live",
              "--rate", "15", *arguments],
-            capture_output=True, text=True, timeout=50, check=False,
+            capture_output=True, text=True, timeout=100, check=False,
         )  # fmt: skip
 
     with daemon.start() as rig:
@@ -150,7 +150,7 @@ def test_a_preview_is_of_now_and_tells_its_age_where_it_is_not(
             [*command, "--json", "-o", str(tmp_path / "a.png")],
             check=True,
             capture_output=True,
-            timeout=60,
+            timeout=100,
         ).stdout
         facts = json.loads(out)["facts"]
         assert facts["age_s"] < 30

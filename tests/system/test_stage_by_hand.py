@@ -170,7 +170,7 @@ def test_the_command_line(staged: Daemon) -> None:
             [sys.executable, "-m", "protocol.cli", "--rig", staged.endpoint, "stage", *arguments],
             capture_output=True,
             text=True,
-            timeout=50,
+            timeout=100,
             check=False,
         )
 

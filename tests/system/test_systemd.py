@@ -240,7 +240,7 @@ class Machine:
         if self.pid:
             os.kill(self.pid, signal.SIGKILL)  # and with PID 1 all that runs inside
         self._unshare.kill()
-        self._unshare.wait(10)
+        self._unshare.wait(60)
 
 
 @pytest.fixture(scope="module")
