@@ -32,6 +32,7 @@ from daemon.doctor.examination import Doctor
 from daemon.manual import Manual
 from daemon.notify import Notifier
 from daemon.publisher import HIGH_WATER, Publisher
+from daemon.reprocessor import Reprocessor
 from daemon.rig import SAFE_S, Rig
 from daemon.runner import LOCK, Runner
 from daemon.server import Server
@@ -146,9 +147,11 @@ class _Daemon:
                 on_activity=changed,
                 make_way=manual.make_way,
             )
+            reprocessor = Reprocessor(store=store, config=self._config, publish=publish)
             commands = Commands(
                 rig=rig,
                 runner=runner,
+                reprocessor=reprocessor,
                 manual=manual,
                 store=store,
                 config=self._config,
@@ -165,22 +168,21 @@ class _Daemon:
                 book=self._book,
                 epoch=epoch,
             )
-            running = None
+            running: list[asyncio.Task[None]] = []
             runner.recover()
             try:
                 await asyncio.to_thread(rig.connect)
                 self._serve(Server(commands_socket, commands.handle, access.caller).serve())
-                running = self._serve(runner.serve())
+                running += [self._serve(runner.serve()), self._serve(reprocessor.serve())]
                 self._serve(self._tend(rig, manual, runner))
                 self._serve(self._watch(rig, runner))
                 if until_eof:
                     self._until_eof(loop)
-                self._notifier.ready(self._status_line(runner))
-                self._log_ready()
+                self._tell_ready(runner)
                 await self._stop.wait()
             finally:  # whatever ends the daemon, the devices end in their safe state
                 commands.stop(self._reason)
-                await self._shut_down(rig, runner, running)
+                await self._shut_down(rig, runner, reprocessor, running)
         log.info("stopped")
         if self._broken:
             raise StartError(f"{self._reason}; the log has the details")
@@ -210,7 +212,8 @@ class _Daemon:
 
         self._book.open(store.runs_folder, logged)
 
-    def _log_ready(self) -> None:
+    def _tell_ready(self, runner: Runner) -> None:
+        self._notifier.ready(self._status_line(runner))
         network = self._config.network
         log.info(
             "ready",
@@ -222,10 +225,15 @@ class _Daemon:
         )
 
     async def _shut_down(
-        self, rig: Rig, runner: Runner, running: asyncio.Task[None] | None
+        self,
+        rig: Rig,
+        runner: Runner,
+        reprocessor: Reprocessor,
+        running: list[asyncio.Task[None]],
     ) -> None:
         log.info("stopping", reason=self._reason)
         self._notifier.stopping()
+        reprocessor.stop()
         runner.stop()
         orderly = asyncio.create_task(self._let_go(rig, running))
         hurried = asyncio.create_task(self._hurry.wait())
@@ -241,10 +249,10 @@ class _Daemon:
             asyncio.get_running_loop().remove_signal_handler(number)
             signal.signal(number, signal.SIG_IGN)
 
-    async def _let_go(self, rig: Rig, running: asyncio.Task[None] | None) -> None:
-        """Wait for the run to be written to its end, and close the devices."""
-        if running is not None:
-            await asyncio.wait([running])
+    async def _let_go(self, rig: Rig, running: list[asyncio.Task[None]]) -> None:
+        """Wait for what is under way to be written to its end, and close the devices."""
+        if running:
+            await asyncio.wait(running)
         await asyncio.to_thread(rig.close)
 
     async def _leave_at_once(self, rig: Rig) -> None:

@@ -7,7 +7,7 @@ long ago, is applied to every later run; run.json records which, and what was le
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -29,6 +29,9 @@ MATTERS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "latency": (("projector", "camera"), ()),
 }
 """Of each kind: the devices that it is of, and the camera settings that it holds for."""
+
+SHOWN_WITH = {"tone": ("tone", "gamma"), "latency": ("latency_s",)}
+"""Kinds that are applied when patterns are shown and exposed, and their values."""
 
 _IDENTITY = ("driver", "model", "serial")
 
@@ -74,6 +77,27 @@ class Calibrations:
         if own != "latency" and "latency_s" not in values:
             ignored += self._assumed_latency(rig, values)
         return {"values": values, "sources": sources, "ignored": ignored}
+
+    def anew(
+        self, then: Mapping[str, Any], rig: Mapping[str, Any], settings: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """What applies today to frames that were taken with the calibration `then`, for `of`'s rig
+        and settings: of what was applied when the frames were exposed that time's values stay."""
+        today = self.of(rig, settings)
+        shown = {name for names in SHOWN_WITH.values() for name in names}
+
+        def mixed(part: str, names: Collection[str]) -> dict[str, Any]:
+            found = {name: value for name, value in today[part].items() if name not in names}
+            return found | {n: value for n, value in then.get(part, {}).items() if n in names}
+
+        return {
+            "values": mixed("values", shown),
+            "sources": mixed("sources", SHOWN_WITH),
+            "ignored": [
+                *(one for one in then.get("ignored", ()) if one["kind"] in SHOWN_WITH),
+                *(one for one in today["ignored"] if one["kind"] not in SHOWN_WITH),
+            ],
+        }
 
     def _assumed_latency(
         self, rig: Mapping[str, Any], values: dict[str, Any]

@@ -18,6 +18,7 @@ from daemon.doctor.examination import Doctor
 from daemon.logs import LogBook
 from daemon.manual import Manual
 from daemon.publisher import Publisher
+from daemon.reprocessor import Reprocessor
 from daemon.rig import SAFE_S, Rig
 from daemon.runner import Runner
 from daemon.scans import catalog
@@ -40,6 +41,7 @@ class Commands:
         *,
         rig: Rig,
         runner: Runner,
+        reprocessor: Reprocessor,
         manual: Manual,
         store: Store,
         config: RigConfig,
@@ -51,6 +53,7 @@ class Commands:
     ) -> None:
         self._rig = rig
         self._runner = runner
+        self._reprocessor = reprocessor
         self._manual = manual
         self._store = store
         self._config = config
@@ -81,6 +84,7 @@ class Commands:
             m.Discover: self._discover,
             m.Examine: self._examine,
             m.Submit: self._submit,
+            m.Reprocess: self._reprocess,
             m.GetQueue: self._queue,
             m.MoveQueued: self._move,
             m.Pause: self._pause,
@@ -157,20 +161,22 @@ class Commands:
                 free_bytes=self._store.free_bytes(),
                 reserve_bytes=self._store.reserve_bytes,
                 sequences=self._publisher.sequences(),
+                reprocessing=self._reprocessor.progress,
             )
         )
 
     def _counted(self, run: RunFolder) -> m.RunInfo:
         """A run as it is now; its counts are written at its end only, so they are asked for."""
-        info, progress = run.info(), self._runner.progress
-        if progress is None or progress.run != run.id:
-            return info
-        return msgspec.structs.replace(
-            info,
-            recorded=progress.recorded,
-            missing=progress.missing,
-            rejected=progress.rejected,
-        )
+        info = run.info()
+        for progress in (self._runner.progress, self._reprocessor.progress):
+            if progress is not None and progress.run == run.id:
+                info = msgspec.structs.replace(
+                    info,
+                    recorded=progress.recorded,
+                    missing=progress.missing,
+                    rejected=progress.rejected,
+                )
+        return info
 
     async def _devices(self, _: m.GetDevices, __: Asked) -> Answer:
         return Answer(m.Devices(devices=self._rig.devices()))
@@ -219,11 +225,23 @@ class Commands:
         )
         return _about(run)
 
+    async def _reprocess(self, command: m.Reprocess, asked: Asked) -> Answer:
+        """Neither a lock nor an emergency stop keeps anybody from it: it touches no device."""
+        by = command.by or asked.caller.name
+        return _about(
+            await asyncio.to_thread(self._reprocessor.submit, command, by, asked.request_id)
+        )
+
     async def _queue(self, _: m.GetQueue, __: Asked) -> Answer:
         return Answer(m.Runs(runs=tuple(run.info() for run in self._runner.queue())))
 
     async def _move(self, command: m.MoveQueued, asked: Asked) -> Answer:
         self._manual.admit(asked.token)
+        if self._reprocessor.mine(command.run) is not None:
+            raise UmbraError(
+                Code.WRONG_STATE,
+                f"{command.run} is made from another run's frames: it waits beside the queue",
+            )
         queue = await asyncio.to_thread(self._runner.move, command.run, command.to)
         return Answer(m.Runs(runs=tuple(run.info() for run in queue)))
 
@@ -232,6 +250,8 @@ class Commands:
         return _about(self._runner.pause(command.run))
 
     async def _resume(self, command: m.Resume, asked: Asked) -> Answer:
+        if (mine := self._reprocessor.mine(command.run)) is not None:
+            return _about(await asyncio.to_thread(self._reprocessor.resume, mine))
         self._manual.admit(asked.token)
         return _about(await asyncio.to_thread(self._runner.resume, command.run))
 
@@ -239,6 +259,8 @@ class Commands:
         by = command.by or asked.caller.name
         # Here and not in a worker: what waits for the workers must not delay it.
         current = self._runner.abort_current(command.run, by)
+        if current is None and (mine := self._reprocessor.mine(command.run)) is not None:
+            return _about(await asyncio.to_thread(self._reprocessor.abort, mine, by))
         if current is None:
             current = await asyncio.to_thread(self._runner.abort, command.run, by)
         return _about(current)
@@ -297,10 +319,10 @@ class Commands:
 
     def _result_of(self, run: RunFolder) -> tuple[Result, dict[str, Any]]:
         """Of a run under way: so far; of one that has ended: as its products have it."""
-        course = self._runner.course
-        if course is not None and course.folder.id == run.id and not run.file.products:
-            found = course.result()
-            return found, found.facts
+        for course in (self._runner.course, self._reprocessor.current):
+            if course is not None and course.folder.id == run.id and not run.file.products:
+                found = course.result()
+                return found, found.facts
         measurement = measured.read(run)
         return (measurement, measurement.facts) if measurement else products.read(run)
 

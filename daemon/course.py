@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -222,6 +222,7 @@ class Course:
             end=None,
             planned=method.planned(),
             rig=rig,
+            bench=bench.recorded(),
             calibration=prepared.calibration,
             sequencing=choice.facts(self._exposed),
         )
@@ -485,7 +486,7 @@ class Course:
         self._update(state=RunState.FINISHING)
         self._say("writing products")
         began = time.monotonic()
-        result = self._with_exposure(recorder.result(_RESULT_S))
+        result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
         self._timings["separate_s"] = time.monotonic() - began
         lost = recorder.lost_patterns
         made = products.write(
@@ -499,37 +500,45 @@ class Course:
         )
         self.folder.add_products(made)
         self._timings["products_s"] = time.monotonic() - began
-        if lost:
-            return End(
-                state=RunState.FAILED,
-                code=Code.FRAMES_MISSING,
-                reason=f"no frame could be had of {len(lost)} of the patterns "
-                f"({', '.join(str(n) for n in lost[:8])}{' ...' if len(lost) > 8 else ''}); "
-                "the products are made without them",
-            )
-        return End(state=RunState.DONE, reason=self._reason)
-
-    def _with_exposure(self, result: Result) -> Result:
-        """The result's facts with the exposure that was chosen, and its problem as advice."""
-        chosen = self.folder.file.rig.get("exposure")
-        if not chosen:
-            return result
-        facts = {**result.facts, "exposure": chosen}
-        if problem := chosen.get("problem"):
-            facts["advice"] = [f"Auto-exposure: {problem}.", *facts.get("advice", ())]
-        return replace(result, facts=facts)
+        return end_of(lost, self._reason)
 
     def _close(self, end: End) -> None:
-        try:
-            self.folder.update(
-                state=end.state, end=end, ended=utc_now(), timings=dict(self._timings)
-            )
-        except (OSError, UmbraError):
-            # Known here, and written as soon as the disk takes it (`Runner.tend`).
-            log.exception("the run's end could not be written yet")
-            self.folder.remember(
-                state=end.state, end=end, ended=utc_now(), timings=dict(self._timings)
-            )
-        say = log.info if end.state is RunState.DONE else log.warning
-        say("run " + end.state, reason=end.reason, code=end.code, by=end.by)
+        close(self.folder, end, self._timings)
         self._on_change()
+
+
+def with_exposure(result: Result, rig: Mapping[str, Any]) -> Result:
+    """The result's facts with the exposure that was chosen for it (run.json's `rig`), and its
+    problem as advice."""
+    chosen = rig.get("exposure")
+    if not chosen:
+        return result
+    facts = {**result.facts, "exposure": chosen}
+    if problem := chosen.get("problem"):
+        facts["advice"] = [f"Auto-exposure: {problem}.", *facts.get("advice", ())]
+    return replace(result, facts=facts)
+
+
+def end_of(lost: Sequence[int], reason: str) -> End:
+    """The end of a run whose products are made; `lost` are patterns that it has no frame of."""
+    if not lost:
+        return End(state=RunState.DONE, reason=reason)
+    return End(
+        state=RunState.FAILED,
+        code=Code.FRAMES_MISSING,
+        reason=f"no frame could be had of {len(lost)} of the patterns "
+        f"({', '.join(str(n) for n in lost[:8])}{' ...' if len(lost) > 8 else ''}); "
+        "the products are made without them",
+    )
+
+
+def close(folder: RunFolder, end: End, timings: Mapping[str, float]) -> None:
+    """Write a run's end; never raises. A disk that is full learns of it later (`Runner.tend`)."""
+    written = {"state": end.state, "end": end, "ended": utc_now(), "timings": dict(timings)}
+    try:
+        folder.update(**written)
+    except (OSError, UmbraError):
+        log.exception("the run's end could not be written yet")
+        folder.remember(**written)
+    say = log.info if end.state is RunState.DONE else log.warning
+    say("run " + end.state, reason=end.reason, code=end.code, by=end.by)

@@ -133,7 +133,7 @@ class Preparation:
             calibration = self._calibration()
         bench = self._rig.bench(calibration["values"])
         return Prepared(
-            method=method_for(self._as_exposed(), bench),
+            method=method_for(as_exposed(self._spec, self._settings), bench),
             bench=bench,
             settings=self._settings,
             calibration=calibration,
@@ -169,12 +169,6 @@ class Preparation:
         if isinstance(spec, OccluderScan) and spec.frame_rate_hz is not None:
             wanted = replace(wanted, frame_rate_hz=spec.frame_rate_hz)
         return wanted
-
-    def _as_exposed(self) -> AnyScan:
-        """The spec with the exposure that was chosen, for methods to reckon with."""
-        if not self._spec.auto_exposure:
-            return self._spec
-        return msgspec.structs.replace(self._spec, exposure_us=self._settings.get("exposure_us"))
 
     def _configure(self, session: Session, wanted: CameraSettings) -> dict[str, Any]:
         camera = self._rig.camera
@@ -230,3 +224,11 @@ class Preparation:
             on_look=self._on_look,
             on_picture=lambda frame, info: self._viewfinder.offer(frame, info, now=True),
         )
+
+
+def as_exposed(spec: AnyScan, settings: Mapping[str, Any]) -> AnyScan:
+    """A spec with the exposure that was chosen, for methods to reckon with; `settings` are the
+    camera's in force."""
+    if not spec.auto_exposure:
+        return spec
+    return msgspec.structs.replace(spec, exposure_us=settings.get("exposure_us"))

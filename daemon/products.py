@@ -53,11 +53,13 @@ def write(
     frame: Picture | None = None,
     truth: Mapping[str, NDArray[np.float32]] | None = None,
     timings: Mapping[str, float] | None = None,
+    frames: Path | None = None,
 ) -> tuple[Product, ...]:
     """Write all products of a result, durably; earlier ones of the same names are replaced.
 
     `full_scale` is the camera's. The frame to be shown is read from the run when `pixel_format`
-    says how; `frame`, an sRGB picture, stands in for it. `truth` are a simulated camera's `direct`
+    says how, or from the run's folder `frames` that this one was made from; `frame`, an sRGB
+    picture, stands in for it. `truth` are a simulated camera's `direct`
     and `global`. Raises StorageError; then the run has the products that it had.
     """
     file = folder.file
@@ -72,7 +74,7 @@ def write(
     # the exposures of a bracket reach beyond one frame's full scale
     scale = max(full_scale, facts.get("exposure_histogram", {}).get("to", 0.0))
     white = min(common_white(_sum(components)), scale)
-    shown = _frame_light(folder.path, records, pixel_format, tone)
+    shown = _frame_light(frames or folder.path, records, pixel_format, tone)
     pictures = {
         "frame": frame if shown is None else for_display(shown, white),
         "direct": for_display(components.direct, white, width=REPORT_WIDTH),

@@ -150,7 +150,8 @@ def _method(file: RunFile) -> str:
 
 def _who(file: RunFile) -> str:
     when = (file.started or file.submitted)[:19].replace("T", " ") + " UTC"
-    return f"{when} · {file.by}" if file.by else when
+    made = f"made from {', '.join(file.parents)}" if file.parents else ""
+    return " · ".join(part for part in (when, file.by, made) if part)
 
 
 def _figures(subject: Subject) -> str:

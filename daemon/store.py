@@ -49,7 +49,8 @@ class RunFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Everything in run.json: what `RunInfo` shows, and what explains or resumes the run.
 
     `order` is the place in the queue, the least first; `rig` the devices and settings at the
-    start; `timings` seconds by name; `estimates` of frames, seconds and bytes before the start.
+    start; `bench` what the method was told of them (`Bench`, without its calibration); `timings`
+    seconds by name; `estimates` of frames, seconds and bytes before the start.
     """
 
     format: int = FORMAT
@@ -70,11 +71,17 @@ class RunFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     request_id: str = ""
     order: int = 0
     rig: dict[str, Any] = {}
+    bench: dict[str, Any] | None = None
     calibration: dict[str, Any] | None = None
     sequencing: dict[str, Any] | None = None
     versions: dict[str, str] = {}
     timings: dict[str, float] = {}
     estimates: dict[str, float] = {}
+
+    @property
+    def reprocessed(self) -> bool:
+        """Whether it is made from another run's frames: it needs no devices."""
+        return bool(self.parents)
 
 
 class DataFolderInUse(UmbraError):
@@ -279,9 +286,20 @@ class Store:
                     self.damaged[path.name] = error.message
 
     def queued(self) -> list[RunFolder]:
-        """The runs that wait, the next first."""
+        """The scans that wait, the next first."""
+        return self._waiting(reprocessed=False)
+
+    def to_reprocess(self) -> list[RunFolder]:
+        """The runs that wait to be made from others, the next first."""
+        return self._waiting(reprocessed=True)
+
+    def _waiting(self, *, reprocessed: bool) -> list[RunFolder]:
         with self._lock:
-            waiting = [run for run in self._known.values() if run.file.state is RunState.QUEUED]
+            waiting = [
+                run
+                for run in self._known.values()
+                if run.file.state is RunState.QUEUED and run.file.reprocessed is reprocessed
+            ]
             return sorted(waiting, key=lambda run: (run.file.order, run.id))
 
     def find_request(self, request_id: str) -> RunFolder | None:
@@ -294,13 +312,16 @@ class Store:
         self, max_age_s: float = math.inf, max_bytes: float = math.inf, keep: Collection[str] = ()
     ) -> list[str]:
         """Delete ended runs older than `max_age_s`, then the oldest while all runs take more than
-        `max_bytes`; never one of `keep`, its parents, or one that has not ended. Gives their ids.
+        `max_bytes`; never one of `keep`, one that has not ended, or a parent of either or of one
+        that can be resumed. Gives their ids.
 
         Raises StorageError; what was deleted until then stays deleted.
         """
         with self._lock:
             runs = self.runs()
-            kept = set(keep).union(*(run.file.parents for run in runs if run.id in keep))
+            kept = set(keep).union(
+                *(run.file.parents for run in runs if run.id in keep or _goes_on(run.file.state))
+            )
             now = self._clock.utc_ns() / NS
             sizes = {run.id: run.size() for run in runs}
             total = sum(sizes.values())
@@ -377,6 +398,11 @@ def versions() -> dict[str, str]:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
     return found
+
+
+def _goes_on(state: RunState) -> bool:
+    """Whether a run may still need what it is made from."""
+    return not state.ended or state is RunState.INTERRUPTED
 
 
 def _page(file: RunFile) -> bytes:

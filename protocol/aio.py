@@ -149,6 +149,23 @@ class AsyncClient(Commands):
         """Queue a scan and hand back its run, at once."""
         return AsyncRun(self, await self.submit(spec, first=first))
 
+    async def reprocess(
+        self,
+        run: AsyncRun | str,
+        *,
+        calibration: Literal["recorded", "now"] = "recorded",
+        **changes: Any,
+    ) -> AsyncRun:
+        """Separate a run's recorded frames anew, with other values for fields of its spec
+        (`leakage=0.04`, `estimator="maxmin"`), and hand back the new run, at once.
+
+        Fields that say what was shown or exposed cannot be changed. `calibration`: the run's own,
+        or what applies now.
+        """
+        which = run if isinstance(run, str) else run.id
+        info = await self.submit_reprocess(which, calibration=calibration, changes=changes)
+        return AsyncRun(self, info)
+
     async def run(self, run: str = "") -> AsyncRun:
         """A handle on a run; "" is the current or else the newest."""
         return AsyncRun(self, await self.run_info(run))

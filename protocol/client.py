@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import zmq
 
@@ -175,6 +175,23 @@ class Client(Commands):
     def scan(self, spec: AnyScan, *, first: bool = False) -> Run:
         """Queue a scan and hand back its run, at once."""
         return Run(self, self.submit(spec, first=first))
+
+    def reprocess(
+        self,
+        run: Run | str,
+        *,
+        calibration: Literal["recorded", "now"] = "recorded",
+        **changes: Any,
+    ) -> Run:
+        """Separate a run's recorded frames anew, with other values for fields of its spec
+        (`leakage=0.04`, `estimator="maxmin"`), and hand back the new run, at once.
+
+        Fields that say what was shown or exposed cannot be changed. `calibration`: the run's own,
+        or what applies now.
+        """
+        which = run if isinstance(run, str) else run.id
+        info = self.submit_reprocess(which, calibration=calibration, changes=changes)
+        return Run(self, info)
 
     def run(self, run: str = "") -> Run:
         """A handle on a run; "" is the current or else the newest."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from typing import (
     TYPE_CHECKING,
     Any,
@@ -20,6 +20,8 @@ from typing import (
     cast,
     overload,
 )
+
+import msgspec
 
 from protocol import messages as m
 from protocol.connection import Ask, checked, expect
@@ -137,6 +139,19 @@ class Commands:
     def submit(self, spec: AnyScan, *, first: bool = False) -> Ask[RunInfo]:
         """Queue a scan, ahead of the others if `first`; comes back at once. `scan` gives a Run."""
         return Ask(m.Submit(spec=spec, by=self.name, first=first), run_of)
+
+    @command
+    def submit_reprocess(
+        self,
+        run: str,
+        *,
+        calibration: Literal["recorded", "now"] = "recorded",
+        changes: Mapping[str, Any] | None = None,
+    ) -> Ask[RunInfo]:
+        """Separate a run's frames anew; comes back at once. `reprocess` gives a Run."""
+        plain = msgspec.to_builtins(dict(changes or {}))
+        asked = m.Reprocess(run=run, changes=plain, calibration=calibration, by=self.name)
+        return Ask(asked, run_of, SLOW_S)
 
     @command
     def queue(self) -> Ask[tuple[RunInfo, ...]]:

@@ -31,9 +31,9 @@ class Following:
     def snapshot(self, status: m.Status, info: RunInfo) -> Progress | None:
         """The progress as of a snapshot, if that is news; `info` is the younger of the two."""
         self._epoch, self._held = status.epoch, dict(status.sequences)
-        there = status.progress
-        if there is not None and there.run == self.run and there.state == info.state:
-            return self._news(there)
+        for there in (status.progress, status.reprocessing):
+            if there is not None and there.run == self.run and there.state == info.state:
+                return self._news(there)
         return self._news(self._of(info))
 
     def outdated_by(self, event: m.Event) -> bool:

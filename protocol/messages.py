@@ -8,7 +8,7 @@ is a `Response` of the same form with the same `id`. Events come on the second e
 from __future__ import annotations
 
 import enum
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, Struct
 
@@ -316,6 +316,21 @@ class Submit(Command, frozen=True, kw_only=True, tag="submit"):
     first: bool = False  # ahead of the queue
 
 
+class Reprocess(Command, frozen=True, kw_only=True, tag="reprocess"):
+    """Separate the recorded frames of a run that has ended anew; answers at once with a new run.
+
+    `changes` are other values for fields of its spec by name, also for those of `radiometry`: the
+    ones that say how frames are read. What says what was shown or exposed is refused. Needs no
+    device, and does not wait in the queue of scans. The run that it is made from stays as it is.
+    """
+
+    role: ClassVar[Role] = Role.OPERATOR
+    run: str
+    changes: dict[str, Any] = {}
+    calibration: Literal["recorded", "now"] = "recorded"  # the run's own, or what applies today
+    by: str = ""
+
+
 class GetQueue(Command, frozen=True, kw_only=True, tag="queue"):
     """The runs that wait, in order."""
 
@@ -545,9 +560,9 @@ class Unlock(Command, frozen=True, kw_only=True, tag="unlock"):
 
 
 AnyCommand = (
-    Hello | GetStatus | GetDevices | Discover | Examine | Submit | GetQueue | MoveQueued
-    | Pause | Resume | Abort | EStop | Reset | ListRuns | GetRun | GetResult | GetProduct
-    | GetLog | GetPreview | StartLive | StopLive
+    Hello | GetStatus | GetDevices | Discover | Examine | Submit | Reprocess | GetQueue
+    | MoveQueued | Pause | Resume | Abort | EStop | Reset | ListRuns | GetRun | GetResult
+    | GetProduct | GetLog | GetPreview | StartLive | StopLive
     | Show | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove
     | StageCircle | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
 )  # fmt: skip
@@ -588,6 +603,7 @@ class Status(Reply, frozen=True, kw_only=True, tag="status"):
     free_bytes: int
     reserve_bytes: int
     sequences: dict[str, int]  # topic -> sequence number of its last event
+    reprocessing: Progress | None = None  # of a run that is reprocessed beside
 
 
 class Devices(Reply, frozen=True, kw_only=True, tag="devices"):
@@ -692,6 +708,7 @@ ANSWERS: dict[type[Command], type[Reply]] = {
     Discover: Discovered,
     Examine: Examined,
     Submit: Run,
+    Reprocess: Run,
     GetQueue: Runs,
     MoveQueued: Runs,
     Pause: Run,
@@ -742,7 +759,7 @@ class RunChanged(EventBody, frozen=True, kw_only=True, tag="run-changed"):
 
 
 class Progressed(EventBody, frozen=True, kw_only=True, tag="progressed"):
-    """The current run went on; at most some ten times a second."""
+    """The current run went on, or one that is reprocessed; at most some ten times a second."""
 
     topic: ClassVar[str] = "progress"
     progress: Progress

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, TypeVar
 
+import msgspec
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation
@@ -40,6 +41,16 @@ class Bench:
     exposure_us: float | None = None  # of the camera as it is set
     gain: float | None = None  # the same
     calibration: Mapping[str, Any] | None = None  # values that apply: see daemon.calibration
+
+    def recorded(self) -> dict[str, Any]:
+        """As run.json keeps it, JSON-able; the calibration has a place of its own there."""
+        found: dict[str, Any] = msgspec.to_builtins(replace(self, calibration=None))
+        return found
+
+    @classmethod
+    def of(cls, recorded: Mapping[str, Any], calibration: Mapping[str, Any]) -> Bench:
+        """The bench that was recorded. Raises msgspec.ValidationError."""
+        return replace(msgspec.convert(recorded, cls), calibration=calibration)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +151,12 @@ class Method(ABC, Generic[S]):
     def recall(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See a frame again that was observed before an interruption; in order."""
         del pixels, observation
+
+    def decides_as(self, other: Method[Any]) -> bool:
+        """Whether `observe` decides on every frame as `other` did, a method of the same scan whose
+        frames are read in another way. If not, all frames are observed again."""
+        del other
+        return True
 
     @abstractmethod
     def estimator(self) -> Estimator:

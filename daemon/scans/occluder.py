@@ -158,6 +158,14 @@ class OccluderMethod(Method[O]):
         elif observation.lighting is Lighting.PATTERN:
             self._decide(pixels)
 
+    def decides_as(self, other: Method[Any]) -> bool:
+        """See `Method`. The camera's place and the source's strength are measured in light."""
+        return (
+            isinstance(other, OccluderMethod)
+            and self.response == other.response
+            and (self.spec.sun, self.spec.align) == (other.spec.sun, other.spec.align)
+        )
+
     def _decide(self, pixels: NDArray[Any]) -> Observation:
         """What a complete frame of the occluder is used for; counted. Depends on nothing but the
         frames before, so that it may be done again."""

@@ -30,6 +30,7 @@ SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "runs": ("runs:runs", "List runs, the newest first."),
         "run": ("runs:run", "One run in detail."),
         "get": ("runs:get", "Fetch a run's products: direct, global, report ..."),
+        "reprocess": ("reprocess:reprocess", "Separate a run's frames anew, with other numbers."),
         "queue": ("runs:queue", "List the waiting runs, or move one."),
         "pause": ("runs:pause", "Pause the run after the step under way."),
         "resume": ("runs:resume", "Go on with a paused or interrupted run."),

@@ -20,6 +20,7 @@ from protocol.cli.output import (
     size,
     when,
 )
+from protocol.cli.watch import count
 from protocol.cli.words import frames, method
 from protocol.errors import Code, UmbraError
 from protocol.following import SILENCE_S
@@ -76,6 +77,9 @@ def _status_lines(now: Status, server: str) -> list[tuple[str, str]]:
             lines.append(("waits for", f"{waits.what}: {waits.seen} ({since})"))
         elif now.progress is not None and now.run.state is RunState.PAUSED:
             lines.append(("why", now.progress.phase))
+    if (beside := now.reprocessing) is not None:
+        told = f"{beside.run}: {count(beside)}" + (f", {beside.phase}" if beside.phase else "")
+        lines.append(("reprocessing", told))
     lines.append(("queue", f"{len(now.queue)} waiting" if now.queue else "empty"))
     if now.lock is not None:
         note = f" ({now.lock.note})" if now.lock.note else ""

@@ -7,11 +7,12 @@ import json
 import sys
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import typer
 
+from protocol import messages as m
 from protocol.cli.delivery import Delivery
 from protocol.cli.family import Family, command_for
 from protocol.cli.link import Json, Keys, Rig, connect
@@ -21,20 +22,25 @@ from protocol.cli.runs import Force, fetch, wanted
 from protocol.cli.watch import conclude, follow, goes_on, tell
 from protocol.cli.words import Fetched
 from protocol.errors import Code, UmbraError
-from protocol.messages import Run
 from protocol.scans import Advise, AnyCalibration, AnyScan, AnySeparation, AnyVerification
+
+if TYPE_CHECKING:
+    from protocol.client import Client
+    from protocol.run import Run
+
+
+Wait = Annotated[bool, typer.Option("-w", "--wait", help="Follow the run; exit as it ended.")]
+WaitOut = Annotated[
+    Path | None,
+    typer.Option("-o", "--out", metavar="DIR", help="Wait, then fetch the products to DIR."),
+]
 
 
 def scan(
     spec: AnyScan,
     *,
-    wait: Annotated[
-        bool, typer.Option("-w", "--wait", help="Follow the run; exit as it ended.")
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="Wait, then fetch the products to DIR."),
-    ] = None,
+    wait: Wait = False,
+    out: WaitOut = None,
     first: Annotated[bool, typer.Option("--first", help="Ahead of the queue.")] = False,
     force: Force = False,
     rig: Rig = None,
@@ -47,27 +53,32 @@ def scan(
         delivery.check()
     with connect(rig, keys) as client:
         run = client.scan(spec, first=first)
-        if delivery is None and not wait:
-            if as_json:
-                print_json(Run(run=run.info))
-            else:
-                print(run.id)
-                if sys.stdout.isatty():
-                    say(f"queued; umbra watch {run.id} follows it")
-            return None
-        with goes_on(run.id):
-            follow(run)
-        code = conclude(run.info)
-        if not as_json and not code:
-            tell(run.facts())
-        files = (
-            []
-            if delivery is None or code
-            else fetch(client, run.info, delivery, wanted(run.info, ""))
-        )
+        return see_through(client, run, delivery, wait=wait, as_json=as_json)
+
+
+def see_through(
+    client: Client, run: Run, delivery: Delivery | None, *, wait: bool, as_json: bool
+) -> int | None:
+    """Follow a run that was asked for, if that is wished, and fetch what it made."""
+    if delivery is None and not wait:
+        if as_json:
+            print_json(m.Run(run=run.info))
+        else:
+            print(run.id)
+            if sys.stdout.isatty():
+                say(f"queued; umbra watch {run.id} follows it")
+        return None
+    with goes_on(run.id):
+        follow(run)
+    code = conclude(run.info)
+    if not as_json and not code:
+        tell(run.facts())
+    files = (
+        [] if delivery is None or code else fetch(client, run.info, delivery, wanted(run.info, ""))
+    )
     if as_json:
         print_json(
-            Fetched(run=run.info, files=tuple(map(str, files))) if files else Run(run=run.info)
+            Fetched(run=run.info, files=tuple(map(str, files))) if files else m.Run(run=run.info)
         )
     elif files:
         for file in files:

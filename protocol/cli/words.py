@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from protocol.cli.output import when
-from protocol.messages import Fact, RunInfo
+from protocol.messages import Fact, RunInfo, RunState
 
 
 def method(run: RunInfo) -> str:
@@ -60,9 +60,14 @@ def ending(run: RunInfo) -> str:
 def rows(runs: tuple[RunInfo, ...]) -> list[list[str]]:
     """Runs as rows of a table; see HEADINGS."""
     return [
-        [r.id, method(r), r.state.value, frames(r), when(r.submitted), r.spec.note or ending(r)]
-        for r in runs
+        [r.id, method(r), r.state.value, frames(r), when(r.submitted), _remark(r)] for r in runs
     ]
+
+
+def _remark(run: RunInfo) -> str:
+    made = f"from {run.parents[0]}" if run.parents else ""
+    said = run.spec.note or ("" if made and run.state is RunState.DONE else ending(run))
+    return " · ".join(part for part in (made, said) if part)
 
 
 HEADINGS = ["run", "method", "state", "frames", "submitted", "note"]

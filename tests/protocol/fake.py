@@ -253,6 +253,10 @@ class FakeRig:
                 return m.Devices(devices=()), {}
             case m.Submit(spec=spec, by=by):
                 return m.Run(run=self._submitted(spec, by)), {}
+            case m.Reprocess(run=run, by=by):
+                made = self._submitted(self._run(run).spec, by)
+                made = self.runs[made.id] = msgspec.structs.replace(made, parents=(run,))
+                return m.Run(run=made), {}
             case m.GetQueue() | m.ListRuns() | m.MoveQueued():
                 return m.Runs(runs=tuple(self.runs.values())), {}
             case m.GetRun(run=run) | m.Pause(run=run) | m.Resume(run=run):

@@ -47,6 +47,13 @@ def test_each_command_has_a_method_and_the_answer_it_names(fake: FakeRig, rig: C
     fake.files["direct"] = b"abc"
     run = rig.submit(Checkerboard(), first=True)
     assert run.by == "me"
+    again = rig.reprocess(run.id, calibration="now", leakage=0.1, periods=(4.0, 8.0))
+    assert again.info.parents == (run.id,)
+    (asked,) = sent(fake, m.Reprocess)
+    assert asked.command == m.Reprocess(
+        run=run.id, calibration="now", changes={"leakage": 0.1, "periods": [4.0, 8.0]}, by="me"
+    )
+    fake.runs.pop(again.id)
     assert rig.status().epoch == fake.epoch == rig.welcome.epoch
     assert rig.devices() == ()
     assert rig.queue() == rig.runs() == rig.move_queued(run.id, 0) == (run,)

@@ -1,0 +1,70 @@
+"""`umbra reprocess`: a run's frames again, read with other numbers."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import replace
+from typing import Annotated, Any
+
+import typer
+
+from protocol.cli.delivery import Delivery
+from protocol.cli.link import Json, Keys, Rig, connect
+from protocol.cli.methods import METHODS, union_options
+from protocol.cli.options import options_of, with_options
+from protocol.cli.runs import Force
+from protocol.cli.scan import Wait, WaitOut, see_through
+from protocol.reading import EXPOSED, READ
+from protocol.scans import Advise
+
+_OPTIONS = [
+    *union_options(METHODS, without=EXPOSED),
+    *(option for option in options_of(Advise) if option.name in READ and option.name != "note"),
+]
+OPTIONS = [replace(option, default=None) for option in _OPTIONS]  # what is not given is as RUN's
+
+
+class Applied(enum.StrEnum):
+    """Which calibration."""
+
+    RECORDED = "recorded"
+    NOW = "now"
+
+
+def _reprocess(
+    *,
+    run: Annotated[str, typer.Argument(metavar="RUN", help="A run that has ended.")],
+    calibration: Annotated[
+        Applied,
+        typer.Option(help="Apply the run's own, or what is known of the rig now."),
+    ] = Applied.RECORDED,
+    wait: Wait = False,
+    out: WaitOut = None,
+    force: Force = False,
+    rig: Rig = None,
+    keys: Keys = None,
+    as_json: Json = False,
+    **given: Any,
+) -> int | None:
+    """Separate a run's recorded frames anew, as a new run; prints its id. RUN stays as it is.
+
+    What is not given is as RUN was told; with nothing given the result is the same, bit for bit.
+    Only what says how frames are read can be changed, not what was shown or exposed. Needs no
+    camera or projector, and waits for no scan.
+
+    --json: a Run; with -o {"run": RunInfo, "files": [path, ...]}.
+    """
+    delivery = None if out is None else Delivery(out, force=force)
+    if delivery is not None:
+        delivery.check()
+    changes = {
+        option.name: option.value_of(given[option.name])
+        for option in OPTIONS
+        if given.get(option.name) is not None
+    }
+    with connect(rig, keys) as client:
+        made = client.reprocess(run, calibration=calibration.value, **changes)
+        return see_through(client, made, delivery, wait=wait, as_json=as_json)
+
+
+reprocess = with_options(_reprocess, [option.parameter() for option in OPTIONS])
