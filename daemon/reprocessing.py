@@ -167,8 +167,9 @@ class Reprocessing:
 
     def _take_in(
         self, frames: FrameStore, own: FrameStore, method: Method[Any], *, again: bool
-    ) -> tuple[int, ...]:
-        """Every frame, in order, into a fresh estimator; gives the patterns that have none."""
+    ) -> dict[int, str]:
+        """Every frame, in order, into a fresh estimator; gives the patterns that have none, and
+        why."""
         estimator = method.estimator()
 
         def conclude() -> Result:
@@ -176,7 +177,7 @@ class Reprocessing:
                 result = estimator.result()
             return method.conclude(result) if isinstance(result, Components) else result
 
-        missing, seen = set[int](), set[int]()
+        missing, seen = dict[int, str](), set[int]()
         scratch = None
         at: tuple[int, Step] | None = None
         for record in frames.records():
@@ -187,7 +188,7 @@ class Reprocessing:
             step = at[1]
             tally = self._tally
             if record.missing:
-                missing.add(record.observation.pattern)
+                missing[record.observation.pattern] = record.missing
                 method.observe(step, _taken(record, None))  # as when it did not come
                 own.append_missing(record)
                 self._tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
@@ -213,9 +214,9 @@ class Reprocessing:
                 own.commit()
             self._taken()
         own.commit()
-        return tuple(sorted(missing - seen))
+        return {pattern: why for pattern, why in sorted(missing.items()) if pattern not in seen}
 
-    def _finish(self, bench: Bench, source: RunFolder, lost: tuple[int, ...]) -> End:
+    def _finish(self, bench: Bench, source: RunFolder, lost: dict[int, str]) -> End:
         file = self.folder.file
         if self._conclude is None:
             raise UmbraError(Code.NO_RESULT, f"{source.id} has no frames: scan again")
