@@ -20,7 +20,7 @@ demo: $(VENV)/.runtime  ## a scan on the virtual rig, with its result in demo-ou
 	$(BIN)/umbra demo -o demo-out --force $(ARGS)
 
 test: $(VENV)/.dev  ## the whole suite; ARGS="-k name" for a part of it
-	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: $(VENV)/.dev  ## ruff, mypy and the import contracts
 	$(BIN)/ruff check .

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from daemon.devicethread import Revoked, Session
 from protocol.messages import End, RunState
 
+_CHECK_S = 0.25
+
 
 class Control:
     """Asked from the loop, obeyed by the sequencer between two steps.
@@ -25,10 +27,11 @@ class Control:
         """Set when whoever waits for something should look again: the end, a device's health."""
 
     def pause(self, reason: str) -> None:
-        """Ask for a pause after the step under way."""
+        """Ask for a pause after the step under way; an end that was asked for comes first."""
         with self._lock:
-            self._reason = reason
-            self._go.clear()
+            if self._end is None:
+                self._reason = reason
+                self._go.clear()
 
     def resume(self) -> None:
         """Go on."""
@@ -39,7 +42,7 @@ class Control:
         with self._lock:
             if self._end is None:
                 self._end = End(state=state, reason=reason, code=code, by=by)
-        self._go.set()
+            self._go.set()
         self.news.set()
 
     @property
@@ -52,17 +55,21 @@ class Control:
         """Whether a pause was asked for."""
         return not self._go.is_set()
 
-    def checkpoint(self, session: Session, on_pause: Callable[[str], None]) -> bool:
+    def checkpoint(
+        self, session: Session, on_pause: Callable[[str], None], check: Callable[[], None]
+    ) -> bool:
         """Between two steps: stay here while paused; True if there was a pause. Raises Revoked.
 
-        `on_pause` is called once, with the reason, before the wait.
+        `on_pause` is called once, with the reason, before the wait; `check` now and then in it, to
+        raise what leaves nothing to go on with.
         """
         self.check(session)
         if self._go.is_set():
             return False
         on_pause(self._reason)
-        while not self._go.wait(0.25):
+        while not self._go.wait(_CHECK_S):
             session.check()
+            check()
         self.check(session)
         return True
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -166,6 +166,7 @@ class Course:
             control=self.control,
             viewfinder=self._viewfinder,
             on_wait=self._wait,
+            on_look=self._look,
             beat=self._alive,
         )
         try:
@@ -238,6 +239,10 @@ class Course:
             scanning = self._rig.clock.now_ns()
             try:
                 self._sequence(session, method, recorder, ring, choice, (step, sub))
+            except BaseException:
+                # Now, for the recorder may wait long for room.
+                self._rig.make_safe(halt=not session.ended.is_set())
+                raise
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.
                 try:
@@ -328,6 +333,11 @@ class Course:
             self._note(RunState.WAITING)
         self._say(f"waiting for {waits.what}: {waits.seen}")
 
+    def _look(self, exposure_s: float) -> None:
+        """A picture is taken before the first frame: a sign of life, and how long the next may take
+        to come."""
+        self.beat, self._exposure_s = time.monotonic(), exposure_s
+
     def _note(self, state: RunState) -> None:
         """Another state, which a full disk must not keep the run from: it is written later
         (`Runner.tend`)."""
@@ -395,6 +405,7 @@ class Course:
         self.beat = time.monotonic()
         if self.folder.file.state is RunState.PAUSED and not self.control.paused:
             self._update(state=RunState.RUNNING)  # it was resumed while it was being paused
+            self._say("scanning")
         if self.beat - self._room_seen < _ROOM_S:
             return
         self._room_seen = self.beat
@@ -475,9 +486,14 @@ class Course:
         self._update(state=RunState.FINISHING)
         self._say("writing products")
         began = time.monotonic()
-        result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
-        self._timings["separate_s"] = time.monotonic() - began
         lost = recorder.lost_patterns
+        try:
+            result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
+        except NotYet:
+            if lost:
+                raise UmbraError(Code.FRAMES_MISSING, f"{_of_lost(lost)}: scan again") from None
+            raise
+        self._timings["separate_s"] = time.monotonic() - began
         made = products.write(
             self.folder,
             result,
@@ -508,17 +524,22 @@ def with_exposure(result: Result, rig: Mapping[str, Any]) -> Result:
     return replace(result, facts=facts)
 
 
-def end_of(lost: Sequence[int], reason: str) -> End:
-    """The end of a run whose products are made; `lost` are patterns that it has no frame of."""
+def end_of(lost: Mapping[int, str], reason: str) -> End:
+    """The end of a run whose products are made; `lost` are patterns that it has no frame of, and
+    why."""
     if not lost:
         return End(state=RunState.DONE, reason=reason)
     return End(
         state=RunState.FAILED,
         code=Code.FRAMES_MISSING,
-        reason=f"no frame could be had of {len(lost)} of the patterns "
-        f"({', '.join(str(n) for n in lost[:8])}{' ...' if len(lost) > 8 else ''}); "
-        "the products are made without them",
+        reason=f"{_of_lost(lost)}; the products are made without them",
     )
+
+
+def _of_lost(lost: Mapping[int, str]) -> str:
+    some = ", ".join(str(n) for n in list(lost)[:8]) + (" ..." if len(lost) > 8 else "")
+    why = list(lost.values())[-1]
+    return f"no frame could be had of {len(lost)} of the patterns ({some}): {why}"
 
 
 def close(folder: RunFolder, end: End, timings: Mapping[str, float]) -> None:

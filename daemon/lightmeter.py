@@ -11,23 +11,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
-import structlog
-
-from daemon.devicethread import Session, Stuck
+from daemon.devicethread import Session
 from daemon.metering import Exposure, Level, Limits, choose, level_of
 from daemon.patterns import render
 from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench, Unsuitable
 from daemon.separation.radiometry import Response
-from daemon.snapshot import snap
-from drivers.base import (
-    CameraInfo,
-    CameraSettings,
-    DeviceError,
-    DeviceGarbled,
-    DeviceTimeout,
-    Frame,
-)
+from daemon.snapshot import snap_whole
+from drivers.base import CameraInfo, CameraSettings, Frame
 from drivers.clock import NS
 from protocol.patterns import WHITE
 from protocol.scans import CalibrateDark, OccluderScan, Spec
@@ -36,8 +27,6 @@ LONGEST_US = 1e6
 """Auto-exposure goes no further unless the spec's own exposure allows it."""
 _SHOW_S = 5.0
 _LIGHT_S = 5.0
-
-log = structlog.get_logger(__name__)
 
 
 def require_meterable(spec: Spec, bench: Bench) -> None:
@@ -72,9 +61,11 @@ class LightMeter:
         response: Response,
         latency_s: float,
         attempts: int,
+        on_look: Callable[[float], None],
         on_picture: Callable[[Frame, CameraInfo], None],
     ) -> None:
-        """`settings` are those of the run, its exposure included; `latency_s` as calibrated."""
+        """`settings` are those of the run, its exposure included; `latency_s` as calibrated.
+        `on_look` is called before each picture with the seconds that it is exposed."""
         self._rig = rig
         self._session = session
         self._spec = spec
@@ -82,6 +73,7 @@ class LightMeter:
         self._response = response
         self._latency_ns = round(latency_s * NS)
         self._attempts = attempts
+        self._on_look = on_look
         self._on_picture = on_picture
 
     def look(self) -> Level:
@@ -111,25 +103,13 @@ class LightMeter:
         return Limits(shortest, max(shortest, longest))
 
     def _picture(self, settings: CameraSettings) -> Level:
-        """Tried again where none came, or half of one: a picture has no effect."""
-        for attempt in range(1, self._attempts + 1):
-            try:
-                frame, info = snap(self._rig.camera, self._session, self._rig.clock, settings)
-            except Stuck:
-                raise
-            except (DeviceTimeout, DeviceGarbled) as error:
-                problem: DeviceError = error
-            else:
-                if not frame.incomplete:
-                    break
-                name = self._rig.camera.device.name
-                problem = DeviceGarbled(name, "look", "half a picture came", "check its cable")
-            if attempt == self._attempts or self._session.ended.is_set():
-                raise problem
-            log.warning("look at the light repeated", attempt=attempt, problem=str(problem))
+        exposure_us = settings.exposure_us or self._rig.camera.device.settings().exposure_us or 0.0
+        self._on_look(exposure_us * 1e-6)
+        frame, info = snap_whole(
+            self._rig.camera, self._session, self._rig.clock, settings, self._attempts
+        )
         self._on_picture(frame, info)
-        exposure_us = frame.exposure_us or settings.exposure_us or 0.0
-        return level_of(frame.pixels, self._response, exposure_us)
+        return level_of(frame.pixels, self._response, frame.exposure_us or exposure_us)
 
     @contextmanager
     def _full_light(self) -> Iterator[None]:

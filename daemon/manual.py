@@ -27,7 +27,7 @@ from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench
 from daemon.scans.single_image import SingleImageMethod
 from daemon.separation.radiometry import Response
-from daemon.snapshot import snap
+from daemon.snapshot import snap, snap_whole
 from daemon.viewfinder import Viewfinder
 from drivers.base import Camera, CameraInfo, CameraSettings, DeviceError, Frame
 from protocol.errors import Code, UmbraError
@@ -35,8 +35,7 @@ from protocol.messages import AnyEvent, LockInfo
 from protocol.patterns import AnyPattern, Stripes
 from protocol.scans import SingleImage
 
-_FRAME_S = 2.0
-_EXPOSE_S = 120.0
+_OFF_S = 2.0
 _LIGHT_S = 600.0
 """How long a light that was switched on by hand stays on when nobody asks again."""
 OWNER = "manual work"
@@ -73,6 +72,8 @@ class Manual:
         self._session: Session | None = None
         self._lock: _Lock | None = None
         self._dark_at = 0.0
+        self._acts = 0  # under way; they last as long as they last, whatever the lease
+        self._for_acts = False  # manual work was begun for them: nobody wants it to go on
 
     # ------------------------------------------------------------ the lock
 
@@ -151,7 +152,7 @@ class Manual:
                 self._lock = None
                 self._end()
                 self._on_change()
-            elif self.active and now >= self._dark_at and self._lock is None:
+            elif self.active and now >= self._dark_at and self._lock is None and not self._acts:
                 log.info("manual work ended: nobody asked again")
                 self._end()
                 self._on_change()
@@ -184,6 +185,7 @@ class Manual:
                 self._session = self._rig.take(OWNER)
                 self._on_change()
             assert self._session is not None
+            self._for_acts = False
             self._dark_at = max(self._dark_at, time.monotonic() + lease_s)
             return self._session
 
@@ -194,6 +196,29 @@ class Manual:
                 self._dark_at = max(self._dark_at, time.monotonic() + lease_s)
 
     # ------------------------------------------------------------ acts
+
+    @contextlib.contextmanager
+    def _act(self) -> Iterator[Session]:
+        """Something that is over when it is done: then the rig is as safe as before, unless another
+        act is under way or somebody wants manual work to go on. Raises UmbraError(busy)."""
+        with self._mutex:
+            if not self.active:
+                self.use(0.0)
+                self._for_acts = True
+            session = self._session
+            assert session is not None
+            self._acts += 1
+        try:
+            with self._noticed():
+                yield session
+        finally:
+            with self._mutex:
+                self._acts -= 1
+                over = self._for_acts and not self._acts and self._session is session
+                futures = self._end() if over else []
+            if over:
+                self._rig.safe_within(futures, SAFE_S)
+                self._on_change()
 
     @contextlib.contextmanager
     def _noticed(self) -> Iterator[None]:
@@ -240,22 +265,14 @@ class Manual:
         if thread is None:
             known = ", ".join(self._rig.lights) or "none"
             raise UmbraError(Code.DEVICE_MISSING, f"no light {name!r}: this rig has {known}")
-        session = self.use(_LIGHT_S if on else _FRAME_S)
+        session = self.use(_LIGHT_S if on else _OFF_S)
         with self._noticed():
             thread.call(lambda light: light.set(on), CALL_S, session)
 
     def snap(self) -> tuple[Frame, CameraInfo]:
         """Take one frame as things are. Raises UmbraError, DeviceError."""
-        camera = self._rig.camera
-        was_active = self.active
-        session = self.use(_FRAME_S)
-
-        try:
-            with self._noticed(), self.live.aside():
-                frame, info = snap(camera, session, self._rig.clock)
-        finally:
-            if not was_active:
-                self.end()
+        with self._act() as session, self.live.aside():
+            frame, info = snap(self._rig.camera, session, self._rig.clock)
         self._viewfinder.offer(frame, info, now=True)
         return frame, info
 
@@ -264,41 +281,26 @@ class Manual:
         rest is set. See `daemon.metering.choose`. Raises UmbraError, DeviceError."""
         camera = self._rig.camera
         start = camera.device.settings().exposure_us or LONGEST_US / 100
-        was_active = self.active
-        session = self.use(_EXPOSE_S)
 
-        def look(exposure_us: float) -> Level:
-            frame, info = snap(
-                camera, session, self._rig.clock, replace(wanted, exposure_us=exposure_us)
-            )
-            self._viewfinder.offer(frame, info, now=True)
-            return level_of(frame.pixels, response, frame.exposure_us or exposure_us)
+        with self._act() as session, self.live.aside():
 
-        try:
-            with self.live.aside():
-                return choose(look, start, limits_of(self._rig, wanted.exposure_us))
-        except DeviceError as error:
-            self._rig.failed(error)
-            raise
-        finally:
-            if not was_active:
-                self.end()
+            def look(exposure_us: float) -> Level:
+                settings = replace(wanted, exposure_us=exposure_us)
+                frame, info = snap_whole(camera, session, self._rig.clock, settings)
+                self._viewfinder.offer(frame, info, now=True)
+                return level_of(frame.pixels, response, frame.exposure_us or exposure_us)
+
+            return choose(look, start, limits_of(self._rig, wanted.exposure_us))
 
     def configure(self, wanted: CameraSettings) -> CameraSettings:
         """Change camera settings; gives those in force. Raises UmbraError, DeviceError."""
         camera = self._rig.camera
         if wanted == CameraSettings():
             return camera.device.settings()
-        was_active = self.active
-        session = self.use(_FRAME_S)
 
         def set_camera(device: Camera) -> CameraSettings:
             device.stop()  # a live view may have left it acquiring
             return device.configure(wanted)
 
-        try:
-            with self._noticed(), self.live.aside():
-                return camera.call(set_camera, CALL_S, session)
-        finally:
-            if not was_active:
-                self.end()
+        with self._act() as session, self.live.aside():
+            return camera.call(set_camera, CALL_S, session)

@@ -64,9 +64,11 @@ class Preparation:
         control: Control,
         viewfinder: Viewfinder,
         on_wait: Callable[[Waiting], None],
+        on_look: Callable[[float], None],
         beat: Callable[[], None],
     ) -> None:
-        """`on_wait` is told what the run waits for, `beat` called while the stage is homed."""
+        """`on_wait` is told what the run waits for, `on_look` the seconds of each exposure before a
+        look at the light, `beat` called while the stage is homed."""
         self._folder = folder
         self._spec = folder.file.spec
         self._rig = rig
@@ -75,6 +77,7 @@ class Preparation:
         self._control = control
         self._viewfinder = viewfinder
         self._on_wait = on_wait
+        self._on_look = on_look
         self._beat = beat
         self._found: CameraSettings | None = None  # as the camera was before the run
         self._settings: dict[str, Any] = {}
@@ -218,6 +221,7 @@ class Preparation:
             response=response_of(radiometry, self._rig.bench(values)),
             latency_s=float(values.get("latency_s", 0.0)),
             attempts=self._config.sequencer.attempts,
+            on_look=self._on_look,
             on_picture=lambda frame, info: self._viewfinder.offer(frame, info, now=True),
         )
 

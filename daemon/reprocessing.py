@@ -173,8 +173,9 @@ class Reprocessing:
 
     def _take_in(
         self, frames: FrameStore, own: FrameStore, method: Method[Any], *, again: bool
-    ) -> tuple[int, ...]:
-        """Every frame, in order, into a fresh estimator; gives the patterns that have none."""
+    ) -> dict[int, str]:
+        """Every frame, in order, into a fresh estimator; gives the patterns that have none, and
+        why."""
         estimator = method.estimator()
 
         def conclude() -> Result:
@@ -182,7 +183,7 @@ class Reprocessing:
                 result = estimator.result()
             return method.conclude(result) if isinstance(result, Components) else result
 
-        missing, seen = set[int](), set[int]()
+        missing, seen = dict[int, str](), set[int]()
         scratch = None
         at: tuple[int, Step] | None = None
         for record in frames.records()[: len(frames)]:  # it may be resumed meanwhile
@@ -194,7 +195,7 @@ class Reprocessing:
             step = at[1]
             tally = self._tally
             if record.missing:
-                missing.add(record.observation.pattern)
+                missing[record.observation.pattern] = record.missing
                 method.observe(step, _taken(record, None))  # as when it did not come
                 own.append_missing(record)
                 self._tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
@@ -221,14 +222,14 @@ class Reprocessing:
             self._taken()
             self._give_way(time.monotonic() - began)
         own.commit()
-        return tuple(sorted(missing - seen))
+        return {pattern: why for pattern, why in sorted(missing.items()) if pattern not in seen}
 
     def _give_way(self, took_s: float) -> None:
         """After a frame that took so long: beside a scan, leave it the rest of the time."""
         if self._busy():
             self.control.news.wait(took_s * (1.0 / _SHARE - 1.0))  # an end is not waited for
 
-    def _finish(self, bench: Bench, source: RunFolder, lost: tuple[int, ...]) -> End:
+    def _finish(self, bench: Bench, source: RunFolder, lost: dict[int, str]) -> End:
         file = self.folder.file
         if self._conclude is None:
             raise UmbraError(Code.NO_RESULT, f"{source.id} has no frames: scan again")

@@ -3,14 +3,14 @@ sleeps.
 
 How pattern steps are exposed is chosen once a run (`daemon.exposing.modes`): the projector times
 whole sequences, or each step is shown and triggered, or the camera runs free. A video step is
-exposed in one way only. Between two steps a run can be paused; after an abort or a failure the
+exposed in one way only. Between two steps a run can be paused; after the last one it is dark, the
 camera is stopped, and its exposure is as it was before.
 """
 
 from __future__ import annotations
 
-from daemon.exposing.apparatus import RING_S, Apparatus
-from daemon.exposing.exposer import Behind, Exposer
+from daemon.exposing.apparatus import Apparatus
+from daemon.exposing.exposer import Exposer
 from daemon.exposing.modes import Choice, Mode
 from daemon.exposing.sequences import Sequences
 from daemon.exposing.stepped import Stepped
@@ -79,12 +79,11 @@ class Sequencer:
 
     def _digest(self) -> None:
         """Wait until the estimator knows every frame so far."""
-        while not self._its.recorder.digested(RING_S):
-            if not self._its.control.paused:
-                raise Behind
-            self._its.checkpoint()  # the disk is full
+        recorder = self._its.recorder
+        self._its.when_recorded(lambda seconds: recorder.digested(seconds) or None)
 
     def _stop(self) -> None:
+        """Nothing more is exposed, and the recorder may wait long for room: not in this light."""
         if not self._its.session.ended.is_set():
-            self._its.stop()
+            self._its.rest()
             self._its.set_exposure(None)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import structlog
 
-from daemon.devicethread import DeviceThread, Session
+from daemon.devicethread import DeviceThread, Session, Stuck
 from drivers.base import (
     Acquisition,
     Camera,
     CameraInfo,
     CameraSettings,
     DeviceError,
+    DeviceGarbled,
     DeviceLost,
+    DeviceTimeout,
     Frame,
 )
 from drivers.clock import Clock
@@ -20,6 +23,8 @@ _PATIENCE_S = 2.0
 """Beyond exposure and readout, until a frame is called lost."""
 _CALL_S = 10.0
 """Beyond the exposure: deadline of everything about one picture."""
+
+log = structlog.get_logger(__name__)
 
 
 def snap(
@@ -59,4 +64,34 @@ def snap(
         return frame, info
 
     exposure_us = (wanted and wanted.exposure_us) or camera.device.settings().exposure_us or 0.0
-    return camera.call(take, exposure_us * 1e-6 + _CALL_S, session)
+    # of one that runs free a whole exposure may pass before the one that counts begins
+    return camera.call(take, 2 * exposure_us * 1e-6 + _CALL_S, session)
+
+
+def snap_whole(
+    camera: DeviceThread[Camera],
+    session: Session,
+    clock: Clock,
+    wanted: CameraSettings,
+    attempts: int = 3,
+) -> tuple[Frame, CameraInfo]:
+    """The same, tried again where no picture came, or half of one: it has no effect.
+
+    Raises DeviceError, Revoked.
+    """
+    problem: DeviceError
+    for attempt in range(1, attempts + 1):
+        try:
+            frame, info = snap(camera, session, clock, wanted)
+        except Stuck:
+            raise
+        except (DeviceTimeout, DeviceGarbled) as error:
+            problem = error
+        else:
+            if not frame.incomplete:
+                return frame, info
+            name = camera.device.name
+            problem = DeviceGarbled(name, "look", "half a picture came", "check its cable")
+        session.check()  # of a camera that was halted nothing else can be said
+        log.warning("picture taken again", attempt=attempt, problem=str(problem))
+    raise problem

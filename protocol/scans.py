@@ -36,7 +36,10 @@ SUN_DEG = 0.53  # angular diameter
 AXIS = "axis along which the pattern varies: x makes vertical stripes"
 LEAKAGE = "brightness b of an unlit source element as a fraction of a lit one"
 MODE = "how frames are kept in step with patterns: see docs/projectors.md"
-ESTIMATOR = "how frames become components; maxmin is the paper's, auto the best for the method"
+ESTIMATOR = (
+    "how frames become components; maxmin is the paper's, maxmin-unbiased the same less what noise "
+    "and blur do to it, auto the best for the method"
+)
 
 
 class Reference(enum.StrEnum):
@@ -173,9 +176,9 @@ class PatternScan(Scan, frozen=True, kw_only=True):
     mode: (
         Annotated[Literal["auto", "hardware", "software", "free"], Meta(description=MODE)] | None
     ) = None
-    estimator: Annotated[Literal["auto", "maxmin", "topk", "lsq"], Meta(description=ESTIMATOR)] = (
-        "auto"
-    )
+    estimator: Annotated[
+        Literal["auto", "maxmin", "maxmin-unbiased", "topk", "lsq"], Meta(description=ESTIMATOR)
+    ] = "auto"
 
 
 class Checkerboard(PatternScan, frozen=True, kw_only=True, tag="checkerboard"):

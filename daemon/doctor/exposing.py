@@ -33,6 +33,8 @@ _LATE_S = 0.25
 _WIRE_S = 0.5  # a frame that no pulse has asked for by then does not come
 _SEEN = 0.01  # of full scale: what light must change at least
 _SATURATED = 0.01
+_PROMPT_S = 5e-3  # a frame that begins this soon after the flip began at it
+_TRIES = 4  # a busy host takes longer to trigger it, at times
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,19 +170,28 @@ def lit(name: str, dark: Shot, light: Shot) -> list[Check]:
     return [ok(name, told)]
 
 
-def latency(dark: Shot, early: Shot, light: Shot) -> Check:
-    """Whether a frame that began right after the flip has all of the light."""
+def latency(dark: Shot, early: Shot, light: Shot, flip_ns: int) -> Check:
+    """Whether a frame that began right after the flip has all of the light. One that began later
+    than that has light that is late as well, so it proves nothing."""
     name = "projector: latency"
     share = (early.mean - dark.mean) / (light.mean - dark.mean)
-    if 0.97 < share < 1.03:
-        return ok(name, "a frame that begins at the flip has all of its light")
-    missing_ms = (1 - share) * early.exposure_us / 1e3
-    return failed(
-        name,
-        f"a frame that begins at the flip has {100 * share:.0f} % of its light: it comes some "
-        f"{missing_ms:.1f} ms later than the projector says",
-        "umbra calibrate latency, which scans then apply",
-    )
+    after_s = (early.start_ns - flip_ns) / NS
+    if not 0.97 < share < 1.03:
+        missing_ms = (1 - share) * early.exposure_us / 1e3
+        return failed(
+            name,
+            f"a frame that begins at the flip has {100 * share:.0f} % of its light: it comes some "
+            f"{missing_ms:.1f} ms later than the projector says",
+            "umbra calibrate latency, which scans then apply",
+        )
+    if after_s > _PROMPT_S:
+        return warning(
+            name,
+            f"no frame began sooner than {after_s * 1e3:.1f} ms after the flip; light that is "
+            "later than the projector says, but not by more, is not seen here",
+            "umbra calibrate latency measures it; on a host that is less busy this sees more",
+        )
+    return ok(name, "a frame that begins at the flip has all of its light")
 
 
 def projector_checks(
@@ -192,17 +203,26 @@ def projector_checks(
     """Black, white at once, white settled. Raises DeviceError."""
     info = projector.device.info()
     black, white = (np.full((info.height, info.width), level, np.uint8) for level in (0, 255))
-    projector.call(lambda p: p.show(black), _CALL_S, session)
-    clock.wait(SETTLE_S, session.ended)
-    [dark] = shoot(camera, session)
-    projector.call(lambda p: p.show(white), _CALL_S, session)
-    [early] = shoot(camera, session)
+
+    def flipped() -> tuple[Shot, Shot, int]:
+        """A dark frame, and one as soon after the flip to white as can be; when it flipped."""
+        projector.call(lambda p: p.show(black), _CALL_S, session)
+        clock.wait(SETTLE_S, session.ended)
+        [dark] = shoot(camera, session)
+        flip_ns = projector.call(lambda p: p.show(white), _CALL_S, session)
+        [early] = shoot(camera, session)
+        return dark, early, flip_ns
+
+    free = "software" not in camera.device.info().triggers
+    for _ in range(1 if free else _TRIES):
+        dark, early, flip_ns = flipped()
+        if early.start_ns - flip_ns <= _PROMPT_S * NS:
+            break
     clock.wait(SETTLE_S, session.ended)
     [light] = shoot(camera, session)
     checks = lit("projector: light", dark, light)
-    free = "software" not in camera.device.info().triggers
     if light.mean - dark.mean >= _SEEN and not free:
-        checks.append(latency(dark, early, light))
+        checks.append(latency(dark, early, light, flip_ns))
     projector.call(lambda p: p.safe(), _CALL_S, session)
     checks.append(periods(light.exposure_us, info.refresh_hz))
     return checks

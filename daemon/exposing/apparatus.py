@@ -6,9 +6,10 @@ after the projector said so, and images are drawn through the inverse of its `to
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import structlog
@@ -28,12 +29,16 @@ from drivers.base import Acquisition, Camera, CameraInfo, CameraSettings, Frame
 from drivers.clock import NS
 from protocol.patterns import AnyPattern
 
+T = TypeVar("T")
+
 SHOW_S = 5.0
 """Deadline of a flip: many refreshes, even of a slow projector."""
 CALL_S = 5.0
 """Deadline of a camera call that does not wait for light."""
 RING_S = 30.0
 """How long a stepped scan waits for the recorder before it says that the disk does not keep up."""
+LOOK_S = 0.05
+"""How often a wait looks whether the run was paused or ended, or the recorder has failed."""
 
 log = structlog.get_logger(__name__)
 
@@ -105,9 +110,14 @@ class Apparatus:
     def checkpoint(self) -> bool:
         """Stay here while paused, dark and held; True if there was a pause: then nothing is lit and
         the camera is stopped. Nothing may be under way. Raises Revoked."""
-        return self.control.checkpoint(self.session, self._paused)
+        return self.control.checkpoint(self.session, self._paused, self.recorder.check)
 
     def _paused(self, reason: str) -> None:
+        self.rest()
+        self._on_pause(reason)
+
+    def rest(self) -> None:
+        """Camera stopped, dark, held, for as long as nothing is exposed: the session goes on."""
         self.stop()
         self.lit = None
         if self.projector is not None:
@@ -116,7 +126,6 @@ class Apparatus:
             light.call(lambda x: x.safe(), SAFE_S, self.session)
         if self.rig.stage is not None:
             self.rig.stage.call(lambda s: s.safe(), SAFE_S, self.session)
-        self._on_pause(reason)
 
     # ------------------------------------------------------------ camera
 
@@ -178,16 +187,23 @@ class Apparatus:
         self.camera.call(lambda c: c.configure(wanted), CALL_S, self.session)
 
     def buffer(self) -> Buffer:
-        """A free buffer; there may have been a pause, for a disk that is full.
+        """A free buffer; see `when_recorded`."""
+        return self.when_recorded(self.ring.take)
 
-        Raises Behind, or what went wrong in the recorder.
+    def when_recorded(self, ask: Callable[[float], T | None]) -> T:
+        """What `ask`, given the seconds that it may wait, has when the recorder has got on.
+
+        There may have been a pause meanwhile, for a disk that is full: nothing may be under way.
+        Raises Behind, Revoked, or what went wrong in the recorder.
         """
-        while (buffer := self.ring.take(RING_S)) is None:
+        due = time.monotonic() + RING_S
+        while (found := ask(LOOK_S)) is None:
             self.recorder.check()
-            if not self.control.paused:
+            if self.checkpoint():
+                due = time.monotonic() + RING_S
+            elif time.monotonic() >= due:
                 raise Behind
-            self.checkpoint()
-        return buffer
+        return found
 
     # ------------------------------------------------------------ light
 

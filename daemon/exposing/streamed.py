@@ -86,6 +86,7 @@ class Streamed(Exposer):
         deadline = max(its.clock.now_ns(), from_ns) + round(self._patience_s() * NS)
         passed = 0
         while its.clock.now_ns() < deadline:
+            its.may_go_on()
             its.session.check()
             try:
                 frame = self._grab(buffer)

@@ -6,8 +6,7 @@ import numpy as np
 import structlog
 
 from daemon.devicethread import Stuck
-from daemon.exposing.apparatus import CALL_S, RING_S, Apparatus
-from daemon.exposing.exposer import Behind
+from daemon.exposing.apparatus import CALL_S, Apparatus
 from daemon.motion import Mover
 from daemon.ring import Buffer
 from daemon.scans.method import Watch
@@ -45,22 +44,31 @@ class Video:
         """
         its = self._its
         self._set_going(step)
-        began = its.clock.now_ns()
+        going_ns, since = 0, its.clock.now_ns()  # before the last pause, and after it
         sub: int | None = first
         try:
             while sub is not None and (step.frames is None or sub < step.frames):
                 its.may_go_on()
-                if self._mover is not None and its.control.paused:
-                    self._mover.end()
-                if its.checkpoint():
+                its.control.check(its.session)
+                if its.control.paused:
+                    going_ns += its.clock.now_ns() - since
+                    self._pause()
                     self._set_going(step)
-                if reason := self._enough((its.clock.now_ns() - began) / NS):
+                    since = its.clock.now_ns()
+                if reason := self._enough((going_ns + its.clock.now_ns() - since) / NS):
                     return reason
                 sub = self._next(index, step, sub)
         finally:
             if self._mover is not None:
                 self._mover.end()
         return ""
+
+    def _pause(self) -> None:
+        """Stage and stream end, and begin anew, even if it is resumed before it came to a pause."""
+        if self._mover is not None:
+            self._mover.end()
+        if not self._its.checkpoint():
+            self._its.stop()
 
     def _set_going(self, step: Watch) -> None:
         """Lights on, the stage going, the camera streaming."""
@@ -92,13 +100,11 @@ class Video:
         """Take a frame or record why there is none; the next sub-index, None at the end of a
         recording."""
         its, info, last = self._its, self._its.info, self._last
-        buffer = its.ring.take(RING_S if info.recorded else 0.0)
+        buffer = its.buffer() if info.recorded else its.ring.take(0.0)
+        if its.acquire(Acquisition.FREE):
+            last = self._last = None  # there was a pause, for a disk that is full
         behind = buffer is None
         if buffer is None:
-            if info.recorded and its.control.paused:
-                return sub  # the disk is full
-            if info.recorded:
-                raise Behind
             buffer = np.empty(info.shape, info.pixel_format.dtype)
         try:
             frame = self._grab(buffer)

@@ -19,8 +19,10 @@ from daemon.separation.estimator import Estimator, Lighting, Observation
 from daemon.separation.exposure_noise import ROUNDING, Sensor
 from daemon.separation.extremes import MaxMin
 from daemon.separation.frameset import FrameSet, Watched
+from daemon.separation.noise import Noise
+from daemon.separation.order_estimate import KEEP, RANKS
 from daemon.separation.radiometry import Response
-from daemon.separation.topk import KEEP, TopK
+from daemon.separation.topk import TopK
 from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.scans import PatternScan, Radiometry, Reference
 
@@ -47,6 +49,7 @@ def response_of(radiometry: Radiometry, bench: Bench) -> Response:
     if black is None:
         black = float(calibration.get("black", bench.camera.black_level))
     pixel_format = bench.camera.pixel_format
+    noise = _calibrated_noise(radiometry, bench)
     try:
         return Response(
             full_scale=pixel_format.full_scale,
@@ -54,9 +57,21 @@ def response_of(radiometry: Radiometry, bench: Bench) -> Response:
             tone=radiometry.tone,
             saturation=radiometry.saturation,
             bayer=pixel_format.bayer,
+            noise=None
+            if noise is None
+            else Noise.of_read_and_shot(*noise, black, pixel_format.full_scale),
         )
     except ValueError as error:
         raise Unsuitable(str(error), "$.radiometry") from error
+
+
+def _calibrated_noise(radiometry: Radiometry, bench: Bench) -> tuple[float, float] | None:
+    """Read noise and counts an electron as calibrated; None where they are not, or where counts are
+    encoded, for they are of light."""
+    found = (bench.calibration or {}).get("noise")
+    if found is None or radiometry.tone != "linear":
+        return None
+    return float(found["read_counts"]), float(found["counts_per_e"])
 
 
 def leakage_of(radiometry: Radiometry, bench: Bench) -> float:
@@ -239,13 +254,14 @@ class PatternMethod(Method[P]):
         """See `Method`. Exposures of a bracket are merged before the method's own estimator."""
         if self.spec.bracket is None:
             return self._watched(self.response, self.spec.average)
+        noise = _calibrated_noise(self.spec.radiometry, self.bench)
         return Bracketed(
             self.response,
             lambda response: self._watched(response, 1),
             factors=self.spec.bracket,
             average=self.spec.average,
             own_us=self._own_us,
-            sensor=self._sensor(),
+            sensor=None if noise is None else Sensor(noise[0] ** 2 + ROUNDING, noise[1]),
         )
 
     def _watched(self, response: Response, average: int) -> Estimator:
@@ -262,13 +278,6 @@ class PatternMethod(Method[P]):
         """Whether no two patterns are alike."""
         return True
 
-    def _sensor(self) -> Sensor | None:
-        """The camera's noise as calibrated; None where it is not, or counts are not linear."""
-        known = (self.bench.calibration or {}).get("noise")
-        if known is None or not self.response.is_linear:
-            return None
-        return Sensor(known["read_counts"] ** 2 + ROUNDING, known["counts_per_e"])
-
     @abstractmethod
     def separator(self, response: Response, average: int) -> Estimator:
         """A fresh estimator of the method, for `average` frames a pattern and a response to light
@@ -284,22 +293,27 @@ class RankedMethod(PatternMethod[P]):
     """A set of two-valued patterns of one lit fraction, of which each pixel's brightest and darkest
     samples tell direct from global."""
 
-    estimators = ("topk", "maxmin")
+    estimators = ("topk", "maxmin", "maxmin-unbiased")
+
+    even_nearby: ClassVar[bool] = True
+    """Whether each pattern lights as much of any neighbourhood."""
 
     def weights(self) -> NDArray[np.complex128] | None:
         """What tells the pattern's place at a pixel: see `handedness.WaveSums`. None: nothing."""
         return None
 
     def separator(self, response: Response, average: int) -> Estimator:
-        """See `PatternMethod`. The paper's max/min where it is asked for, or where there are too
-        few patterns to rank; else topk."""
+        """See `PatternMethod`. What is asked for; else topk, or max/min where there are too few
+        patterns to rank, less the bias of noise where there are enough to know it."""
         name = self.spec.estimator
-        if name == "topk" and len(self._patterns) < 2 * KEEP:
+        few = len(self._patterns) < 2 * KEEP
+        if name == "topk" and few:
             raise Unsuitable(
                 f"topk ranks {2 * KEEP} patterns at least; take maxmin for {len(self._patterns)}",
                 "$.estimator",
             )
-        if name == "maxmin" or len(self._patterns) < 2 * KEEP:
+        if name.startswith("maxmin") or few:
+            known = len(self._patterns) >= 2 * RANKS
             return MaxMin(
                 response,
                 lit_fraction=self.lit_fraction,
@@ -307,6 +321,8 @@ class RankedMethod(PatternMethod[P]):
                 average=average,
                 levels=self.levels,
                 weights=self.weights(),
+                even=self.even_nearby,
+                unbiased=name == "maxmin-unbiased" or (name == "auto" and known),
             )
         return TopK(
             response,
@@ -315,4 +331,5 @@ class RankedMethod(PatternMethod[P]):
             levels=self.levels,
             average=average,
             weights=self.weights(),
+            even=self.even_nearby,
         )

@@ -205,6 +205,13 @@ class Radiance(Response):
             np.sqrt(total * np.float32(1.0 / self.average)) / weights, dtype=np.float32
         )
 
+    @property
+    def noise_from(self) -> str | None:
+        """See `Response`: a bracket's exposures tell it, once there are two to compare."""
+        if self.meter is None or not self.meter.measured:
+            return None
+        return self.meter.source
+
     def wave_deviations(
         self, noise: Noise | None, mean: Plane, amplitude: Plane
     ) -> tuple[Plane, Plane]:

@@ -146,8 +146,12 @@ class ExposureNoise:
         """From what the noise is known."""
         if self._known is not None:
             return "calibration"
-        compared = any(rows[0].any() for rows in self._rows.values())
-        return "exposures compared" if compared else "one picture"
+        return "exposures compared" if self.measured else "one picture"
+
+    @property
+    def measured(self) -> bool:
+        """Whether it is measured, not an upper bound."""
+        return self._known is not None or any(rows[0].any() for rows in self._rows.values())
 
     def ratios(self) -> dict[tuple[float, float], float]:
         """By pairs of exposures: how much longer the longer one is by its light."""

@@ -16,7 +16,7 @@ from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.handedness import WaveSums
-from daemon.separation.order_model import extremes
+from daemon.separation.order_estimate import Explained, Followed, OrderStatistics, estimate
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import NOT_SHIFTS, of_shifts
@@ -28,9 +28,10 @@ class MaxMin:
     """L_max and L_min over patterns of one lit fraction -> direct, global (Eq. 8).
 
     With `average` > 1 the frames of each pattern are averaged in linear light before they are
-    compared; a pattern counts once its last frame is in. `levels` is as for `TopK`: with it the
-    planes `direct_std`, `global_std` and the bias of noise are stated (at sharp patterns), which
-    is not taken off. With `weights` (of `handedness.WaveSums`) a mirror is found.
+    compared; a pattern counts once its last frame is in. `levels` and `even` are as for `TopK`:
+    with them there are the planes `direct_std` and `global_std`, and the bias of noise and of blur
+    is stated; it is taken off only if `unbiased`. With `weights` (of `handedness.WaveSums`) a
+    mirror is found.
     """
 
     def __init__(
@@ -42,9 +43,15 @@ class MaxMin:
         average: int = 1,
         levels: Callable[[float], Plane] | None = None,
         weights: NDArray[np.complex128] | None = None,
+        even: bool = True,
+        unbiased: bool = False,
     ) -> None:
+        if unbiased and levels is None:
+            raise ValueError("the bias of noise follows from the levels of the pattern set")
         self._waves = None if weights is None else WaveSums(weights)
-        self._extremes = None if levels is None else extremes(levels(0.0))
+        self._order = None if levels is None else OrderStatistics(levels, even)
+        self._followed = None if self._order is None else Followed(self._order.keep)
+        self._unbiased = unbiased
         self._average_of = average
         self._response = response
         self._alpha = lit_fraction
@@ -109,6 +116,8 @@ class MaxMin:
         else:
             np.maximum(self._max, samples, out=self._max)
             np.minimum(self._min, samples, out=self._min)
+        if self._followed is not None:
+            self._followed.add(samples)
         self._patterns += 1
 
     def result(self) -> Components:
@@ -119,22 +128,35 @@ class MaxMin:
         saturated = self._saturated
         if saturated is None:
             saturated = self._max >= self._response.saturated_from
-        ambient, source = self._references.ambient(brightest, darkest, self._alpha, self._leakage)
+        explained = self._explained()
+        told = self._noise.told() if explained is None else explained.told
+        deviation, b = told.deviation(brightest), self._leakage
+        g = light_model.global_weight(self._alpha, b)
         lit, unlit = brightest, darkest
+        planes: dict[str, NDArray[Any]] = {}
+        found: dict[str, Any] = {}
+        if explained is not None:
+            low, high = darkest[None], brightest[None]
+            dark, deviation = explained.deviations(low, high)
+            ends = estimate(explained.model, low, high, dark, deviation, k=1)
+            direct_var, global_var = ends.variances(b, g, explained.uneven)
+            reference = self._reference_share() / (g * explained.uneven) ** 2
+            global_var += np.square(dark) * np.float32(reference)
+            planes = {"direct_std": np.sqrt(direct_var), "global_std": np.sqrt(global_var)}
+            found = {"blur_px": explained.blur, **explained.systematic(ends, deviation, b, g, k=1)}
+            if self._unbiased:
+                lit, unlit = ends.lit, ends.unlit
+        ambient, source = self._references.ambient(lit, unlit, self._alpha, b)
         if ambient is not None:
-            lit, unlit = brightest - ambient, darkest - ambient
-        direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
-        planes, bias = self._stated(brightest, darkest)
-        deviation = self._noise.deviation(brightest)
+            lit, unlit = lit - ambient, unlit - ambient
+        direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, b)
         moved: NDArray[np.uint16] | None = None
         steady: dict[str, Any] = {}
         advice: list[str] = []
         if abs(self._alpha - 0.5) < HALF:
             middle = (brightest + darkest) * np.float32(0.5)
-            moved, steady, advice = compare(
-                self._references, middle, deviation, self._leakage, ranked=True
-            )
-        mirrored, told, as_declared = of_shifts(self._waves, deviation)
+            moved, steady, advice = compare(self._references, middle, deviation, b, ranked=True)
+        mirrored, looked, as_declared = of_shifts(self._waves, deviation)
         flags = np.zeros(direct.shape[:2], dtype=np.uint16) if moved is None else moved
         if mirrored is not None:
             flags |= bits(mirrored, Quality.RESIDUE)
@@ -148,49 +170,33 @@ class MaxMin:
             flags=flags,
             judgement=Judgement.of_extremes(deviation, self._patterns),
             facts={
-                "estimator": "maxmin",
+                "estimator": "maxmin-unbiased" if self._unbiased else "maxmin",
                 "patterns": self._patterns,
                 "unused_frames": self._unused,
                 "lit_fraction": self._alpha,
-                "leakage": self._leakage,
-                "noise_from": self._noise.source,
-                **bias,
-                **told,
+                "leakage": b,
+                **told.facts(),
+                **found,
+                **looked,
                 **steady,
-                "advice": ([] if as_declared else [NOT_SHIFTS]) + advice,
                 **self._references.facts(source),
+                "advice": ([] if as_declared else [NOT_SHIFTS]) + advice + told.advice(),
             },
         )
 
-    def _stated(
-        self, brightest: Plane, darkest: Plane
-    ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Deviations of the components from noise, and the medians of what noise adds to them."""
-        if self._extremes is None:
-            return {}, {}
-        b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
-        most, least = (self._noise.deviation(light) for light in (brightest, darkest))
-        of = self._extremes
-        high, low = most * np.float32(of.lit_spread), least * np.float32(of.unlit_spread)
-        reference = 0.0
+    def _explained(self) -> Explained | None:
+        """Blur and noise; None where the levels of the pattern set are not known."""
+        if self._order is None or self._followed is None:
+            return None
+        low, high = (self._light(ranks) for ranks in self._followed.ranks())
+        return self._order.explain(low, high, self._noise, self._response, self._average_of)
+
+    def _reference_share(self) -> float:
+        """The variance of ambient light over that of a pattern's averaged frames."""
         for kind in (Lighting.AMBIENT, Lighting.BLACK):
-            if not reference and self._references.frames(kind):
-                reference = self._average_of / self._references.frames(kind)
-        scale = np.float32(1.0 / ((1.0 - b) * g))
-        of_dark = np.square(low) + np.square(least) * np.float32(reference * (1.0 - b) ** 2)
-        planes: dict[str, NDArray[Any]] = {
-            "direct_std": np.hypot(high, low) * np.float32(1.0 / (1.0 - b)),
-            "global_std": np.sqrt(of_dark + np.square(high) * np.float32(b * b)) * scale,
-        }
-        up, down = (
-            float(np.median(light)) * factor
-            for light, factor in ((most, of.lit_bias), (least, of.unlit_bias))
-        )
-        bias = {
-            "direct": round((up - down) / (1.0 - b), 3),
-            "global": round((down - b * up) / ((1.0 - b) * g), 3),
-        }
-        return planes, {"bias_of_noise": bias}
+            if frames := self._references.frames(kind):
+                return self._average_of / frames
+        return 0.0
 
     def _light(self, samples: NDArray[Any]) -> Plane:
         return self._response.linear(samples) if self._mean is None else samples

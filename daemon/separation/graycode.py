@@ -139,7 +139,8 @@ class GrayCodeDecoder:
         if not self._difference:
             raise NotYet("the fine stripes of the Gray code have not come yet")
         b = self._leakage
-        deviation = self._noise.deviation(self._brightest)
+        told = self._noise.told()
+        deviation = told.deviation(self._brightest)
         contrast, stripe = self._finest(deviation)
         direct = contrast * np.float32(1.0 / (1.0 - b))
         pair = self._whole * np.float32(1.0 / self._pairs)
@@ -148,10 +149,10 @@ class GrayCodeDecoder:
         moved, steady, advice = compare(self._references, half, deviation, b)
         indirect: Plane = total.light - direct
         step = contrast * np.float32(0.5)
-        pair_var = np.square(self._noise.deviation(half + step))
-        pair_var += np.square(self._noise.deviation(half - step))
+        pair_var = np.square(told.deviation(half + step))
+        pair_var += np.square(told.deviation(half - step))
         direct_std: Plane = np.sqrt(pair_var) * np.float32(1.0 / (1.0 - b))
-        global_var = total.of_references(self._noise.deviation) * np.float32(self._average)
+        global_var = total.of_references(told.deviation) * np.float32(self._average)
         global_var += pair_var * np.asarray(total.of_half * (0.25 / self._pairs), np.float32)
         global_std: Plane = np.sqrt(direct_std**2 + global_var)
         planes: dict[str, NDArray[Any]] = {
@@ -161,13 +162,13 @@ class GrayCodeDecoder:
         }
         coordinates = self.coordinates(np.float32(SIGNIFICANT) * _grey(deviation))
         planes.update(coordinates)
-        told = mirrored_coordinates(
+        mirrors = mirrored_coordinates(
             coordinates,
             self._strength(contrast, pair, deviation),
             self._stripes(),
         )
         sums, unequal = self._sums.told(float(np.median(deviation)))
-        flags = bits(told.mirrored, Quality.RESIDUE)
+        flags = bits(mirrors.mirrored, Quality.RESIDUE)
         if moved is not None:
             flags |= moved
         return finish(
@@ -189,16 +190,16 @@ class GrayCodeDecoder:
                 "unused_frames": self._unused,
                 "lit_fraction": 0.5,
                 "leakage": b,
-                "noise_from": self._noise.source,
+                **told.facts(),
                 "stripes": {
                     str(width): round(float(np.mean(stripe == width)), 4)
                     for width in np.unique(stripe).tolist()
                 },
                 **self._references.facts(total.source),
                 **steady,
-                **told.facts,
+                **mirrors.facts,
                 **sums,
-                "advice": unequal + told.advice + advice,
+                "advice": unequal + mirrors.advice + advice + told.advice(),
             },
         )
 

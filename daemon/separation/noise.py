@@ -20,6 +20,9 @@ Plane = NDArray[np.float32]
 _MAD = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 _ROUNDING = 12.0**-0.5  # deviation of a count's rounding error
 
+_CLIPPED = 4.0  # deviations above 0 counts from which noise is whole
+_CURVE = 65  # levels that a calibrated curve is given at
+
 _LEVELS = 32
 _PER_OCTAVE = 8  # bins of a difference: 1/8 octave
 _BINS = 17 * _PER_OCTAVE
@@ -42,6 +45,25 @@ class Noise:
     def deviation(self, counts: NDArray[Any]) -> Plane:
         """Standard deviation at each sample's level: float32, same shape; linear between levels."""
         return np.asarray(np.interp(counts, self.levels, self.deviations), dtype=np.float32)
+
+    @classmethod
+    def of_read_and_shot(
+        cls, read_counts: float, counts_per_e: float, black: float, full_scale: int
+    ) -> Noise:
+        """Of a calibrated linear camera: variance read² + counts_per_e x (counts - black), and the
+        rounding of counts."""
+        root = np.linspace(0.0, np.sqrt(max(full_scale - black, 1.0)), _CURVE)  # even in its bends
+        levels = np.square(root)
+        variance = read_counts**2 + counts_per_e * levels + _ROUNDING**2
+        return cls(tuple((levels + black).tolist()), tuple(np.sqrt(variance).tolist()))
+
+    def over(self, other: Noise) -> float:
+        """This deviation over another's: the median over this one's levels, but for those so near
+        to 0 counts that noise is cut off."""
+        levels, expected = np.asarray(self.levels), other.deviation(np.asarray(self.levels))
+        ratio = np.asarray(self.deviations) / expected
+        whole = levels > _CLIPPED * expected
+        return float(np.median(ratio[whole] if whole.any() else ratio))
 
     def of_a_sensor(self) -> Noise:
         """The same, with no level noisier than a linear sensor can be: its variance a + b x level

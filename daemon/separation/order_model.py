@@ -10,20 +10,36 @@ had again) and ranked.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 Plane = NDArray[np.float32]
 
-BLURS = (0.0, 0.2, 0.4, 0.55, 0.7, 0.85, 1.0, 1.2, 1.4, 1.6, 1.8, 2.1, 2.4)
+_KNOTS = (0.0, 0.4, 0.55, 0.7, 0.85, 1.0, 1.2, 1.4, 1.6, 1.8, 2.1, 2.4)
+
+# Of each interval but the first three parts, errors between knots being interpolated; a mean of a
+# sharp pattern's and of a slightly blurred one's is neither's.
+_TRIED = ((0, 0.0), *((at, part / 3) for at in range(1, len(_KNOTS) - 1) for part in range(3)))
+BLURS = (
+    *(round(_KNOTS[at] * (1 - part) + _KNOTS[at + 1] * part, 4) for at, part in _TRIED),
+    _KNOTS[-1],
+)
 """Standard deviations of the projector's blur that are tried, in projector pixels."""
 
 RATIOS = (0.001, 0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Noise of a sample over the step from unlit to lit, for which errors are tabulated."""
 
-_PRIOR = 0.02  # relative misfit that a factor e between fitted and pictured noise costs
+_FINE = np.linspace(np.log(RATIOS[0]), np.log(RATIOS[-1]), 240)
+_AMOUNTS = np.geomspace(1 / 30, 30, 172)  # 1 is not among them
+_KNOWN = 1.0  # relative misfit that a factor e between fitted and known noise costs
+_ABOVE = 0.1  # ... that a picture shows, which has at least its noise
+_UNEVEN = 0.02  # ... either way, where patterns light a neighbourhood differently
+_BELOW = 0.004  # ... at most, for texture in the picture may be the reason, ...
+_TEXTURE = 0.2  # ... and half of that at this logarithm
+_ALIKE = 0.1  # blurs whose cost differs by so much of the least explain about as well
+_LOUD = 0.04  # noise over the step below which blur shows, and a picture matters less
 _DOUBT = 0.5  # a bias that is corrected still costs this part of it: blur differs over a scene
 
 
@@ -31,105 +47,136 @@ _DOUBT = 0.5  # a bias that is corrected still costs this part of it: blur diffe
 class OrderErrors:
     """Errors of estimates from the k brightest and darkest, for one blur; step = 1.
 
-    First axis RATIOS. `step`: mean of the raw step (two brightest less two darkest); `gaps`
-    (ratios, keep - 1): mean distance of each rank from the first, over both ends, by raw step;
-    `k`: the number of samples to average; `lit`, `unlit` (ratios, keep): bias of means of k;
-    `spread_step`, `spread_unlit`: standard deviations of lit - unlit and of unlit, `covariance`
-    theirs.
+    First axis RATIOS. `gaps` (ratios, 2, keep - 1): mean distance of each rank from the first, of
+    the brightest and of the darkest samples, by the raw step (two brightest less two darkest).
+    `lit`, `unlit` (ratios, keep): bias of means of k. Variances and covariance of the two, from
+    noise alone (`lit_noise`, `unlit_noise`, `shared_noise`) and from where a pixel lies in the
+    pattern (`lit_place`, `unlit_place`, `shared_place`), which repeated scans do not show.
     """
 
-    step: NDArray[np.float64]
     gaps: NDArray[np.float64]
-    k: NDArray[np.int64]
     lit: NDArray[np.float64]
     unlit: NDArray[np.float64]
-    spread_step: NDArray[np.float64]
-    spread_unlit: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    lit_noise: NDArray[np.float64]
+    unlit_noise: NDArray[np.float64]
+    shared_noise: NDArray[np.float64]
+    lit_place: NDArray[np.float64]
+    unlit_place: NDArray[np.float64]
+    shared_place: NDArray[np.float64]
+
+    @property
+    def step(self) -> NDArray[np.float64]:
+        """Mean of the raw step (ratios)."""
+        return self.steps(min(2, self.lit.shape[1]))
+
+    def steps(self, k: int) -> NDArray[np.float64]:
+        """Mean of the k brightest less the k darkest (ratios)."""
+        return 1.0 + self.lit[:, k - 1] - self.unlit[:, k - 1]
+
+    @property
+    def k(self) -> NDArray[np.int64]:
+        """The number of samples whose mean has the least error (ratios)."""
+        bias = np.maximum(np.abs(self.lit), np.abs(self.unlit))
+        noise = self.lit_noise + self.unlit_noise - 2.0 * self.shared_noise
+        place = self.lit_place + self.unlit_place - 2.0 * self.shared_place
+        cost = noise + place + (2.0 * _DOUBT * bias) ** 2
+        return np.asarray(np.argmin(cost, axis=1) + 1)
 
 
 def simulate(levels: Callable[[float], Plane], keep: int) -> tuple[OrderErrors, ...]:
     """Errors for each of BLURS. `levels(blur)` gives (patterns, samples) of a pixel's level, 0 to
     1, at places all over the pattern set."""
-    return tuple(_errors(levels(blur).astype(np.float64), keep) for blur in BLURS)
+    knots = [_errors(levels(blur), keep) for blur in _KNOTS]
+    found = [_between(knots[at], knots[at + 1], part) for at, part in _TRIED]
+    return (*found, knots[-1])
 
 
-def _errors(levels: NDArray[np.float64], keep: int) -> OrderErrors:
-    rng = np.random.default_rng(0)
-    noise = rng.standard_normal(levels.shape)
-    rows = []
-    for ratio in RATIOS:
-        ranked = np.sort(levels + ratio * noise, axis=0)
-        low, high = ranked[:keep], ranked[::-1][:keep]
-        raw = high[:2].mean(axis=0) - low[:2].mean(axis=0)
-        step = float(raw.mean())
-        gaps = ((high[:1] - high[1:]) + (low[1:] - low[:1])).mean(axis=1) / (2 * step)
-        best = None
-        biases = []
-        for k in range(1, keep + 1):
-            lit, unlit = high[:k].mean(axis=0) - 1.0, low[:k].mean(axis=0)
-            biases.append((lit.mean(), unlit.mean()))
-            bias = max(abs(lit.mean()), abs(unlit.mean()))
-            cost = (lit - unlit).var() + (2 * _DOUBT * bias) ** 2
-            if best is None or cost < best[0]:
-                covariance = np.cov(lit - unlit, unlit)
-                best = cost, k, covariance
-        assert best is not None
-        rows.append((step, gaps, best[1], np.array(biases), best[2]))
-    covariances = np.stack([row[4] for row in rows])
+def _between(low: OrderErrors, high: OrderErrors, part: float) -> OrderErrors:
     return OrderErrors(
-        step=np.array([row[0] for row in rows]),
-        gaps=np.stack([row[1] for row in rows]),
-        k=np.array([row[2] for row in rows]),
-        lit=np.stack([row[3][:, 0] for row in rows]),
-        unlit=np.stack([row[3][:, 1] for row in rows]),
-        spread_step=np.sqrt(covariances[:, 0, 0]),
-        spread_unlit=np.sqrt(covariances[:, 1, 1]),
-        covariance=covariances[:, 0, 1],
+        *((1.0 - part) * getattr(low, f.name) + part * getattr(high, f.name) for f in fields(low))
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Extremes:
-    """Bias and spread of the largest and the smallest sample for noise of deviation 1, far smaller
-    than the step from unlit to lit."""
+def _errors(levels: Plane, keep: int) -> OrderErrors:
+    rng = np.random.default_rng(0)
+    places = np.ascontiguousarray(levels.T, dtype=np.float32)
+    # two draws a place: what they differ by is noise, not place
+    noise = rng.standard_normal((2, *places.shape), dtype=np.float32)
+    k = np.arange(1, keep + 1)
+    rows = []
+    for ratio in RATIOS:
+        ranked = np.sort(places + np.float32(ratio) * noise, axis=-1)
+        low = ranked[..., :keep].astype(np.float64)
+        high = ranked[..., ::-1][..., :keep].astype(np.float64)
+        apart = np.stack([high[..., :1] - high[..., 1:], low[..., 1:] - low[..., :1]])
+        lit, unlit = np.cumsum(high, axis=-1) / k - 1.0, np.cumsum(low, axis=-1) / k
+        biases = lit.mean(axis=(0, 1)), unlit.mean(axis=(0, 1))
+        lit -= biases[0]
+        unlit -= biases[1]
+        two = min(2, keep) - 1
+        gaps = apart.mean(axis=(1, 2)) / (1.0 + biases[0][two] - biases[1][two])
+        of_noise = _covariances(lit[0] - lit[1], unlit[0] - unlit[1]) / 2.0
+        whole = (_covariances(lit[0], unlit[0]) + _covariances(lit[1], unlit[1])) / 2.0
+        rows.append((gaps, *biases, *of_noise, *(whole - of_noise)))
+    return OrderErrors(*(np.stack(column) for column in zip(*rows, strict=True)))
 
-    lit_bias: float
-    unlit_bias: float
-    lit_spread: float
-    unlit_spread: float
 
-
-def extremes(levels: Plane) -> Extremes:
-    """For a sharp pattern set, `levels` (patterns, samples) as for `simulate` with no blur."""
-    noise = np.random.default_rng(0).standard_normal(levels.shape)
-    lit = np.where(levels > 0.5, noise, -np.inf).max(axis=0)
-    unlit = np.where(levels <= 0.5, noise, np.inf).min(axis=0)
-    lit, unlit = lit[np.isfinite(lit)], unlit[np.isfinite(unlit)]
-    return Extremes(*(float(v) for v in (lit.mean(), unlit.mean(), lit.std(), unlit.std())))
+def _covariances(lit: NDArray[np.float64], unlit: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of (places, keep): the variances of both, and their covariance: (3, keep)."""
+    pairs = (lit, lit), (unlit, unlit), (lit, unlit)
+    return np.stack([np.einsum("pk,pk->k", a, b) for a, b in pairs]) / len(lit)
 
 
 def fit(
-    models: tuple[OrderErrors, ...], gaps: NDArray[np.float64], seen: NDArray[np.float64]
-) -> tuple[int, NDArray[np.float64]]:
-    """The blur (an index of BLURS) and each group's noise ratio that explain observed gaps.
+    models: tuple[OrderErrors, ...],
+    gaps: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    *,
+    known: bool = False,
+    even: bool = True,
+) -> tuple[int, NDArray[np.float64], int, float]:
+    """The blur (an index of BLURS) and the noise that explain observed gaps.
 
-    `gaps` (groups, keep - 1) as in `OrderErrors`. Blur spreads the ranks ever wider, noise the
-    first ones most, so that the two are told apart; where hardly, `seen` (groups), the noise over
-    the raw step as a picture shows it, decides.
+    `gaps` (groups, 2, keep - 1) as in `OrderErrors`. `noise` (kinds, groups, 2) is that of the lit
+    and of the unlit over the raw step, as it may depend on their light; how much of it there is, is
+    found, starting from 1 times. Blur spreads the ranks ever wider, noise the first ones most, and
+    blur in proportion to the step, so that the two are told apart; where hardly, the 1 decides,
+    more so if `known`, less so if patterns do not light every neighbourhood alike (`even`).
+
+    Returns the noise over the step (groups, 2), its kind, and how much of it there is.
     """
-    fine = np.geomspace(RATIOS[0], RATIOS[-1], 200)
-    size = (gaps**2).sum(axis=1)  # misfits are relative to it, for each group to have its say
-    best: tuple[float, int, NDArray[np.float64]] | None = None
+    size = (gaps**2).sum(axis=(1, 2))  # misfits are relative to it, for each group to have its say
+    log = np.log(RATIOS)
+    away = np.log(_AMOUNTS)
+    loud = min(float(np.median(noise)) / _LOUD, 1.0)
+    texture = _BELOW * loud / (1.0 + np.square(_TEXTURE / away))
+    below, above = (_KNOWN * away**2,) * 2 if known else (texture, _ABOVE * away**2)
+    prior = np.where(away > 0, above, below) if even else _UNEVEN * away**2
+    wanted = np.log(noise)[:, None] + away[:, None, None]  # (kinds, amounts, groups, 2)
+    group, end = np.indices(noise.shape[1:])
+    costs = np.empty(len(models))
+    found: list[tuple[NDArray[np.float64], int, float]] = []
     for index, model in enumerate(models):
         table = np.stack(
-            [np.interp(np.log(fine), np.log(RATIOS), column) for column in model.gaps.T], axis=1
-        )
-        misfit = ((gaps[:, None, :] - table[None]) ** 2).sum(axis=2) / size[:, None]
-        raw = fine / np.interp(np.log(fine), np.log(RATIOS), model.step)
-        misfit += _PRIOR * np.log(raw[None, :] / seen[:, None]) ** 2
-        cost = float(misfit.min(axis=1).sum())
-        if best is None or cost < best[0]:
-            best = cost, index, fine[np.argmin(misfit, axis=1)]
-    assert best is not None
-    return best[1], best[2]
+            [np.interp(_FINE, log, column) for column in model.gaps.reshape(log.size, -1).T], axis=1
+        ).reshape(_FINE.size, *gaps.shape[1:])
+        misfit = ((gaps[:, None] - table[None]) ** 2).sum(axis=3) / size[:, None, None]
+        raw = _FINE - np.log(np.interp(_FINE, log, model.step))
+        place = np.interp(wanted, raw, np.arange(raw.size))
+        cost = misfit[group, np.rint(place).astype(np.intp), end].sum(axis=3)
+        cost += 2.0 * prior[:, None]  # (kinds, amounts, groups)
+        if even:
+            kind, amount = (
+                int(n) for n in np.unravel_index(int(np.argmin(cost.sum(axis=2))), cost.shape[:2])
+            )
+            costs[index] = cost[kind, amount].sum()
+        else:  # what global light adds differs from group to group
+            kind = int(np.argmin(cost.min(axis=1).sum(axis=1)))
+            costs[index] = cost[kind].min(axis=0).sum()
+            amount = int(np.median(np.argmin(cost[kind], axis=0)))
+        ratios = np.exp(np.interp(place[kind, amount], np.arange(raw.size), _FINE))
+        found.append((ratios, kind, float(_AMOUNTS[amount])))
+    # of blurs that explain it about as well the mean: none of them is far from it
+    weight = np.exp((costs.min() - costs) / (_ALIKE * costs.min() + 1e-9))
+    blur = round(float(weight @ np.arange(costs.size) / weight.sum()))
+    return blur, *found[blur]

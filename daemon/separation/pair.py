@@ -12,7 +12,7 @@ from daemon.separation.estimator import Components, Lighting, NotYet, Observatio
 from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
-from daemon.separation.scan_noise import ScanNoise
+from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import compare
 from daemon.separation.straddling import Straddling
 
@@ -63,7 +63,8 @@ class ComplementPair:
         ambient, source = self._ambient(first, second)
         lit, unlit = (first, second) if ambient is None else (first - ambient, second - ambient)
         brightest = np.maximum(first, second)
-        deviation = self._noise.deviation(brightest)
+        told = self._noise.told()
+        deviation = told.deviation(brightest)
         moved, steady, advice = compare(
             self._references, (first + second) * np.float32(0.5), deviation, self._leakage
         )
@@ -83,7 +84,7 @@ class ComplementPair:
             brightest=brightest,
             saturated=self._saturated,
             flags=flags,
-            planes=self._deviations(deviation, self._noise.deviation(np.minimum(first, second))),
+            planes=self._deviations(told, deviation, told.deviation(np.minimum(first, second))),
             judgement=Judgement.of_extremes(deviation, 2),
             facts={
                 "estimator": "complement pair",
@@ -91,16 +92,16 @@ class ComplementPair:
                 "unused_frames": self._unused,
                 "lit_fraction": self._alpha,
                 "leakage": self._leakage,
-                "noise_from": self._noise.source,
+                **told.facts(),
                 **self._references.facts(source),
                 **steady,
                 **pattern.facts,
                 **self._residual(first, second),
-                "advice": advice,
+                "advice": advice + told.advice(),
             },
         )
 
-    def _deviations(self, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
+    def _deviations(self, told: Told, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
         """Standard deviations of direct and global from noise where lit and unlit; edges of
         checkers, which are the greater error of two images, are not noise."""
         b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
@@ -111,7 +112,7 @@ class ComplementPair:
             reference = self._references.mean(kind)
             if reference is not None:
                 share = self._average * (1.0 - b) ** 2 / self._references.frames(kind)
-                unlit_var += np.square(self._noise.deviation(reference)) * np.float32(share)
+                unlit_var += np.square(told.deviation(reference)) * np.float32(share)
                 break
         return {
             "direct_std": np.hypot(most * np.float32(h), least * np.float32(g))

@@ -20,7 +20,8 @@ class Response:
 
     `full_scale` is the largest count, `black` the counts without light, `tone` the curve that it
     encoded with (linear, srgb, gamma:2.2), `saturation` the counts from which a sample is called
-    saturated (None: full scale), `bayer` the mosaic's first two pixels or "".
+    saturated (None: full scale), `bayer` the mosaic's first two pixels or "", `noise` that of a
+    frame's counts as it was calibrated (None: it was not).
     """
 
     full_scale: int
@@ -28,6 +29,7 @@ class Response:
     tone: str = "linear"
     saturation: float | None = None
     bayer: str = ""
+    noise: Noise | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.full_scale <= 65535:
@@ -113,6 +115,12 @@ class Response:
         table = _deviations(self, noise)
         found: Plane = np.take(table, _whole(counts, self.full_scale), mode="clip")
         return found
+
+    @property
+    def noise_from(self) -> str | None:
+        """From what `deviation` knows the noise by itself, whatever it is handed; None: it does
+        not."""
+        return None
 
     def wave_deviations(
         self, noise: Noise | None, mean: Plane, amplitude: Plane

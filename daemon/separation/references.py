@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.estimator import Lighting
 from daemon.separation.radiometry import FrameMean, Plane, Response
+from daemon.separation.scan_noise import Told
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +118,17 @@ class References:
         )
         frames = (black, of_black), (white, of_white)
         return Total(light, 0.0, of_black + of_white, "black and white frames", frames)
+
+    def whole_variance(self, told: Told, leakage: float) -> Plane:
+        """The variance of `whole`, each reference with the noise of its own light; `told` of frames
+        averaged as a pattern's are."""
+        parts: list[Plane] = []
+        for kind in (Lighting.BLACK, Lighting.WHITE):
+            mean = self.mean(kind)
+            assert mean is not None, "asked for with both frames alone"
+            share = told.average / self.frames(kind) / (1.0 - leakage) ** 2
+            parts.append(np.square(told.deviation(mean)) * np.float32(share))
+        return parts[0] + parts[1]
 
     @property
     def white_saturated(self) -> NDArray[np.bool_] | None:

@@ -7,6 +7,7 @@ comparing frames stays as fast as memory is.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -55,21 +56,111 @@ class ScanNoise:
         found = from_frame(pixels, self._response.full_scale, self._response.bayer)
         self._picture = found if self._picture is None else self._picture.bounded_by(found)
 
+    def own(self) -> Told:
+        """What the scan's frames alone say."""
+        repeats = self._repeats.noise()
+        source = PICTURE if repeats is None else REPEATS
+        source = self._response.noise_from or source
+        return Told(self._response, repeats or self._picture, self._average, source)
+
+    def told(self, ranks: Noise | None = None) -> Told:
+        """What is known by now; `ranks`: the noise of one frame that explains how far apart the
+        ranks of samples are, for which a picture is no match.
+
+        A calibration is believed unless the scan's own frames contradict it: repeats either way,
+        else a picture and ranks together (each may hold more than noise) or a picture with less.
+        """
+        repeats = self._repeats.noise()
+        if repeats is not None:
+            return told(self._response, repeats, REPEATS, [repeats], self._average, sure=True)
+        bounds = [bound for bound in (self._picture, ranks) if bound is not None]
+        if ranks is not None:
+            return told(self._response, ranks, RANKS, bounds, self._average)
+        return told(self._response, self._picture, PICTURE, bounds, self._average)
+
+
+REPEATS, RANKS, PICTURE = "repeated frames", "ranks", "one picture"
+RESIDUALS, CALIBRATION = "residuals of the fit", "calibration"
+
+_SURE, _UNSURE = 1.25, 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What is known of the noise of a pattern's averaged frames, and from what.
+
+    `noise` is that of one frame's counts (None: rounding alone); `agreement` the scan's own figure
+    over the calibrated one (None: none is applied).
+    """
+
+    response: Response
+    noise: Noise | None
+    average: int
+    source: str
+    agreement: float | None = None
+
     @property
     def measured(self) -> bool:
         """Whether it is measured, not an upper bound."""
-        return self._repeats.pairs > 0
-
-    @property
-    def source(self) -> str:
-        """From what the noise is known."""
-        return "repeated frames" if self.measured else "one picture"
+        return self.source != PICTURE
 
     def deviation(self, light: Plane) -> Plane:
         """Standard deviation of a pattern's averaged linear light at a level of it (float32)."""
-        noise = self._repeats.noise() or self._picture
-        one = self._response.deviation(noise, self._response.counts(light))
-        return one * np.float32(self._average**-0.5)
+        one = self.response.deviation(self.noise, self.response.counts(light))
+        if self.average > 1:
+            one *= np.float32(self.average**-0.5)
+        return one
+
+    def wave_deviations(self, mean: Plane, amplitude: Plane) -> tuple[Plane, Plane]:
+        """Those of linear light over the phases of a sinusoid, as its mean and as its wave meet
+        them (float32)."""
+        of_mean, of_wave = self.response.wave_deviations(self.noise, mean, amplitude)
+        by = np.float32(self.average**-0.5)
+        return of_mean * by, of_wave * by
+
+    def facts(self) -> dict[str, Any]:
+        """For quality.json."""
+        facts: dict[str, Any] = {"noise_from": self.source}
+        if self.agreement is not None:
+            facts["noise_of_calibrated"] = round(self.agreement, 3)
+        return facts
+
+    def advice(self) -> list[str]:
+        """A line where the calibration is contradicted."""
+        if self.agreement is None or self.source == CALIBRATION:
+            return []
+        return [
+            f"the frames have {self.agreement:.2g} times the calibrated noise, which is therefore "
+            "not used: run `umbra calibrate noise` again with these camera settings; if it stays, "
+            "light flickers or something moved"
+        ]
+
+
+def told(
+    response: Response,
+    own: Noise | None,
+    source: str,
+    bounds: list[Noise],
+    average: int = 1,
+    *,
+    sure: bool = False,
+) -> Told:
+    """The calibrated noise unless the scan's own contradicts it, else the latter.
+
+    `bounds` are what the scan's frames say, each the noise or more; a picture alone is no proof of
+    more, for texture looks like noise. `sure`: they are the noise.
+    """
+    if response.noise_from is not None:
+        return Told(response, own, average, response.noise_from)
+    calibrated = response.noise
+    if calibrated is None:
+        return Told(response, own, average, source)
+    ratio = min((bound.over(calibrated) for bound in bounds), default=1.0)
+    slack = _SURE if sure else _UNSURE
+    more = ratio > slack and source != PICTURE
+    if more or ratio < 1.0 / slack:
+        return Told(response, own, average, source, ratio)
+    return Told(response, calibrated, average, CALIBRATION, ratio)
 
 
 class ResidualNoise:
@@ -90,15 +181,13 @@ class ResidualNoise:
         residuals = self._frequencies.setdefault(frequency, _Residuals())
         residuals.add(light[::_SAMPLE, ::_SAMPLE], delta)
 
-    @property
-    def source(self) -> str:
-        """From what the noise is known."""
-        return "residuals of the fit" if self.measured else "one picture"
-
-    @property
-    def measured(self) -> bool:
-        """Whether it is measured, not an upper bound."""
-        return self._fitted() is not None
+    def told(self) -> Told:
+        """What is known by now of one frame's noise: see `ScanNoise`."""
+        fitted = self._fitted()
+        if fitted is not None:
+            return told(self._response, fitted, RESIDUALS, [fitted], sure=True)
+        bounds = [] if self._picture is None else [self._picture]
+        return told(self._response, self._picture, PICTURE, bounds)
 
     @property
     def misfit(self) -> float | None:
@@ -113,10 +202,6 @@ class ResidualNoise:
         """What the fit leaves over the wave's amplitude, where that is large: the median."""
         found = [r.distortion() for r in self._frequencies.values() if r.freedom > 0]
         return max(found) if found else None
-
-    def noise(self) -> Noise | None:
-        """Deviation of one frame's counts by level."""
-        return self._fitted() or self._picture
 
     def _fitted(self) -> Noise | None:
         found = [r.variance() for r in self._frequencies.values() if r.freedom > 0]

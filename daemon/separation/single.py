@@ -13,9 +13,10 @@ from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.fineness import astray
 from daemon.separation.finish import Judgement, bits, finish
-from daemon.separation.noise import from_frame
+from daemon.separation.noise import Noise, from_frame
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
+from daemon.separation.scan_noise import PICTURE, Told, told
 from daemon.separation.steadiness import leaks
 
 _ASTRAY = 1.5  # times the change across stripes: along them there is no more
@@ -110,10 +111,11 @@ class PeaksAndValleys:
             lit, unlit = lit - ambient, unlit - ambient
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
         saturated = self._reduced(self._saturated.astype(np.float32)) > 0
-        deviation = self._deviation(picture, brightest)
-        planes = self._stated(deviation, self._deviation(picture, darkest))
-        mirrored = self._mirrored(picture)
-        told = self._told(picture, brightest, darkest)
+        noise = self._noise(picture)
+        deviation = noise.deviation(brightest)
+        planes = self._stated(deviation, noise.deviation(darkest))
+        mirrored = self._mirrored(picture, noise)
+        looked, advice = self._looked(picture, brightest, darkest)
         plain = replace(self._response, bayer="")
         return finish(
             direct,
@@ -131,10 +133,11 @@ class PeaksAndValleys:
                 "lit_fraction": self._alpha,
                 "leakage": self._leakage,
                 "reduced_by": self._reduce,
-                "noise_from": "one picture",
+                **noise.facts(),
                 "mirrors_looked_for": mirrored is not None,
-                **told,
+                **looked,
                 **self._references.facts(source),
+                "advice": advice + noise.advice(),
             },
         )
 
@@ -142,7 +145,7 @@ class PeaksAndValleys:
         """Images separated, and frames not used."""
         return {"images": float(self._images), "unused": float(self._unused)}
 
-    def _told(self, picture: Plane, lit: Plane, unlit: Plane) -> dict[str, Any]:
+    def _looked(self, picture: Plane, lit: Plane, unlit: Plane) -> tuple[dict[str, Any], list[str]]:
         """Whether the picture can be that of the stripes, and of the scene of black and white."""
         lines = []
         step = 2 if self._response.bayer else 1  # to the next sample of a colour
@@ -171,9 +174,9 @@ class PeaksAndValleys:
                 )
             else:
                 lines += leaks(self._references, self._leakage)
-        return {**facts, "advice": lines}
+        return facts, lines
 
-    def _mirrored(self, picture: Plane) -> NDArray[np.bool_] | None:
+    def _mirrored(self, picture: Plane, told: Told) -> NDArray[np.bool_] | None:
         """Where the stripes run astray, at the lower resolution; None without black and white
         frames, which take the scene's own texture out."""
         black = self._references.mean(Lighting.BLACK)
@@ -181,7 +184,7 @@ class PeaksAndValleys:
         if black is None or white is None or abs(self._alpha - 0.5) > _HALF:
             return None
         step, lit = white - black, picture - (white + black) * np.float32(0.5)
-        noise = self._deviation(picture, white) * np.float32(1.5**0.5)  # of the picture, ½(W + K)
+        noise = told.deviation(white) * np.float32(1.5**0.5)  # of the picture, ½(W + K)
         if lit.ndim == 3:
             step, lit = step.sum(axis=2), lit.sum(axis=2)
             noise = np.sqrt(np.square(noise).sum(axis=2))
@@ -211,10 +214,12 @@ class PeaksAndValleys:
             "global_std": np.sqrt(of_dark + of_lit) * np.float32(1.0 / ((1.0 - b) * g)),
         }
 
-    def _deviation(self, picture: Plane, brightest: Plane) -> Plane:
+    def _noise(self, picture: Plane) -> Told:
+        """That of one of the frames that were averaged."""
         counts = self._response.counts(picture)
-        noise = from_frame(counts, self._response.full_scale, self._response.bayer)
-        return self._response.deviation(noise, self._response.counts(brightest))
+        mean = from_frame(counts, self._response.full_scale, self._response.bayer)
+        shown = Noise(mean.levels, tuple(d * self._frames**0.5 for d in mean.deviations))
+        return told(self._response, shown, PICTURE, [shown])
 
     def _extremes(self, picture: Plane) -> tuple[Plane, Plane]:
         """L_max and L_min at the lower resolution, RGB for a mosaic."""

@@ -21,12 +21,11 @@ from daemon.separation.coordinates import other_axis
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import STRONG, strength
-from daemon.separation.noise import Noise
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import mirrored
 from daemon.separation.ripple import ripple
-from daemon.separation.scan_noise import ResidualNoise
+from daemon.separation.scan_noise import ResidualNoise, Told
 from daemon.separation.steadiness import compare
 
 _LEAST_ECCENTRIC = 0.02
@@ -105,7 +104,7 @@ class LeastSquares:
         ready = [fit for fit in self._fits if fit.solvable]
         if not ready or self._saturated is None:
             raise NotYet("a sinusoid needs 3 phases; they have not all come yet")
-        noise = self._noise.noise()
+        noise = self._noise.told()
         blur, blur_from = self._blur(ready)
         solved = [
             self._separate(fit, noise, gain)
@@ -142,7 +141,7 @@ class LeastSquares:
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
-            "noise_from": self._noise.source,
+            **noise.facts(),
             **self._references.facts(
                 self._references.total(ready[0].solve()[0], self._leakage).source
             ),
@@ -154,6 +153,7 @@ class LeastSquares:
                 *_advice(misfit, self._noise.distortion, disagreeing, rippled),
                 *other_axis({n: planes[n] for n in ("column", "row") if n in planes}),
                 *advice,
+                *noise.advice(),
             ],
         }
         return finish(
@@ -209,16 +209,14 @@ class LeastSquares:
             return [1.0] * len(self._fits)
         return [1.0 / of_wave(blur or 0.0, period, self._weave) for period in self._periods]
 
-    def _separate(
-        self, fit: _Fit, noise: Noise | None, gain: float
-    ) -> tuple[Plane, Plane, Plane, Plane]:
+    def _separate(self, fit: _Fit, noise: Told, gain: float) -> tuple[Plane, Plane, Plane, Plane]:
         """Direct, global and their variances from one frequency."""
         mean, cosine, sine = fit.solve()
         b = self._leakage
         power = cosine * cosine + sine * sine
-        of_mean, of_wave = self._response.wave_deviations(noise, mean, np.sqrt(power))
+        of_mean, of_wave = noise.wave_deviations(mean, np.sqrt(power))
         mean_var, wave_var = fit.variances()
-        if self._noise.measured:
+        if noise.measured:
             # |B| of noise alone is not 0: to first order its square is too large by one variance.
             power = np.maximum(power - np.float32(wave_var) * of_wave * of_wave, 0)
         amplitude: Plane = np.sqrt(power)
@@ -228,15 +226,11 @@ class LeastSquares:
         direct_var: Plane = np.square(of_wave) * np.float32(
             wave_var * (2.0 * gain / (1.0 - b)) ** 2
         )
-        total_var = total.of_references(
-            lambda light: self._response.deviation(noise, self._response.counts(light))
-        )
+        total_var = total.of_references(noise.deviation)
         total_var += np.square(of_mean) * np.asarray(mean_var * total.of_half, dtype=np.float32)
         return direct, indirect, direct_var, direct_var + total_var
 
-    def _mirrored(
-        self, fit: _Fit, noise: Noise | None
-    ) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
+    def _mirrored(self, fit: _Fit, noise: Told) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
         """Where the phase runs against the picture's, or changes faster: see `residue`."""
         _, cosine, sine = fit.solve()
         wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
@@ -246,7 +240,7 @@ class LeastSquares:
         even = bool(self._periods)
         return mirrored([wave], strength([wave], deviation), turning=even, smooth=even)
 
-    def _ripple(self, ready: list[_Fit], noise: Noise | None) -> float | None:
+    def _ripple(self, ready: list[_Fit], noise: Told) -> float | None:
         """How much of the wave shows in its own mean and amplitude: see `ripple`."""
         found = []
         for fit in ready:
@@ -260,9 +254,9 @@ class LeastSquares:
         known = [one for one in found if one is not None]
         return max(known) if known else None
 
-    def _level(self, fit: _Fit, noise: Noise | None) -> Plane:
+    def _level(self, fit: _Fit, noise: Told) -> Plane:
         mean, _, _ = fit.solve()
-        return self._response.deviation(noise, self._response.counts(mean))
+        return noise.deviation(mean)
 
     def _correspondence(self, ready: list[_Fit]) -> dict[str, NDArray[Any]]:
         """Wrapped phase of the first frequency, and where the projector lit each pixel."""

@@ -43,6 +43,11 @@ def _specs() -> list[tuple[str, int, AnyScan]]:
     light = Radiometry(leakage=LEAKAGE)
     return [
         ("checkerboard maxmin", 25, Checkerboard(estimator="maxmin", radiometry=light)),
+        (
+            "checkerboard maxmin-unbiased",
+            25,
+            Checkerboard(estimator="maxmin-unbiased", radiometry=light),
+        ),
         ("checkerboard topk", 25, Checkerboard(estimator="topk", radiometry=light)),
         ("two-image", 2, TwoImage(radiometry=light)),
         ("sinusoid N = 3", 3, Sinusoid(phases=3, radiometry=light)),

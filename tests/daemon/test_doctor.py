@@ -264,9 +264,13 @@ def test_light_and_its_latency() -> None:
     assert [c.outcome for c in exposing.lit("l", dark, bright)] == [OK]
     assert [c.outcome for c in exposing.lit("l", dark, shot(0.021))] == [FAILED]
     assert [c.outcome for c in exposing.lit("l", dark, shot(0.9, saturated=0.2))] == [WARNING]
-    assert exposing.latency(dark, shot(0.5), bright).outcome is OK
-    late = exposing.latency(dark, shot(0.26), bright)
+    assert exposing.latency(dark, shot(0.5), bright, 0).outcome is OK
+    late = exposing.latency(dark, shot(0.26), bright, 0)
     assert (late.outcome, "10.0 ms later" in late.message) == (FAILED, True)
+    # A busy host: nothing is known of light that came before the frame began.
+    busy = exposing.latency(dark, shot(0.5, began=30.0), bright, 0)
+    assert (busy.outcome, "sooner than 30.0 ms after" in busy.message) == (WARNING, True)
+    assert exposing.latency(dark, shot(0.26, began=30.0), bright, 0).outcome is FAILED
 
 
 @pytest.mark.parametrize(

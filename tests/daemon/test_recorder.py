@@ -17,6 +17,7 @@ from daemon.recorder import Exposed, Recorder
 from daemon.ring import Ring
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
+from daemon.separation.estimator import NotYet
 from drivers.base import CameraInfo, Frame, PixelFormat, ProjectorInfo
 from protocol.scans import TwoImage
 
@@ -126,4 +127,15 @@ def test_after_a_failed_fsync_nothing_is_repeated(
     with pytest.raises(StorageError):
         recorder.finish()
     assert course.held == 0
+    frames.close()
+
+
+def test_while_the_past_is_taken_in_there_is_no_result(tmp_path: Path) -> None:
+    # The estimator is in use by the thread that replays.
+    frames = store(tmp_path / "run")
+    method = method_for(TwoImage(), Bench(CAMERA, projector=ProjectorInfo(64, 48, 60.0)))
+    ring = Ring(4, SHAPE, np.dtype(np.uint8))
+    recorder = Recorder(method, frames, ring, Course().on_taken, Course().on_full)
+    with pytest.raises(NotYet, match="ask again"):
+        recorder.result(1.0)
     frames.close()

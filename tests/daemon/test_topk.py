@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from daemon.separation.estimator import NotYet, Observation
+from daemon.separation.order_estimate import KEEP
 from daemon.separation.order_model import BLURS, RATIOS, fit, simulate
 from daemon.separation.radiometry import Response
-from daemon.separation.topk import KEEP, TopK
+from daemon.separation.topk import TopK
 from protocol.scans import AnyScan, Checkerboard, RandomBinary
 from tests.daemon.scene import FULL, Scene
 
@@ -86,10 +87,10 @@ def test_blur_and_noise_are_told_apart() -> None:
         return np.where(lit, soft, 1 - soft).astype(np.float32)
 
     models = simulate(levels, KEEP)
-    for blur, at in ((0, 5), (8, 3)):
+    for blur, at in ((0, 5), (BLURS.index(1.4), 3)):
         gaps = np.stack([models[blur].gaps[at]] * 4)
-        seen = np.full(4, RATIOS[at] / models[blur].step[at])
-        found, ratios = fit(models, gaps, seen)
+        seen = np.full((1, 4, 2), RATIOS[at] / models[blur].step[at])
+        found, ratios, _, _ = fit(models, gaps, seen)
         assert BLURS[found] == pytest.approx(BLURS[blur], abs=0.3)
         np.testing.assert_allclose(ratios, RATIOS[at], rtol=0.15)
 

@@ -99,12 +99,12 @@ class Daemon:
     def kill(self) -> None:
         assert self.process is not None
         self.process.kill()
-        self.process.wait(10)
+        self.process.wait(60)
 
     def stop(self) -> int:
         assert self.process is not None
         self.process.terminate()
-        return self.process.wait(20)
+        return self.process.wait(60)
 
     def close(self) -> None:
         if self.process is not None and self.process.poll() is None:
@@ -113,7 +113,7 @@ class Daemon:
             self.process.stdin.close()
 
 
-def until(true: Callable[[], bool], seconds: float = 40.0) -> None:
+def until(true: Callable[[], bool], seconds: float = 90.0) -> None:
     """Ask again and again until something is true; the wait is the question's own round trip."""
     deadline = time.monotonic() + seconds
     while not true():

@@ -46,6 +46,7 @@ def test_roles_and_revocation(daemon: Daemon, tmp_path: Path) -> None:
                 umbra.connect(daemon.endpoint, keys=stranger, timeout_s=0.4)
             assert unheard.value.code is Code.UNREACHABLE
         keys.revoke(server, "ada")
+        operator.timeout_s = 2.0  # no answer ever comes: no need to wait long for it
         with pytest.raises(UmbraError) as ended:
             operator.status()
         assert ended.value.code is Code.UNREACHABLE
@@ -55,7 +56,7 @@ def test_roles_and_revocation(daemon: Daemon, tmp_path: Path) -> None:
 def test_an_open_door_to_the_network_is_refused(daemon: Daemon) -> None:
     text = daemon.config.read_text().replace(f"ipc://{tmp(daemon)}/c", "tcp://0.0.0.0:0")
     daemon.config.write_text(text)
-    assert daemon.launch().wait(20) == 2
+    assert daemon.launch().wait(60) == 2
     assert "umbra keys new" in daemon.log()
 
 
@@ -71,7 +72,7 @@ def test_thirty_lines_of_pyzmq_and_json_scan(daemon: Daemon, tmp_path: Path) -> 
             [sys.executable, script, daemon.endpoint],
             capture_output=True,
             text=True,
-            timeout=50,
+            timeout=100,
             check=False,
         )
     assert done.returncode == 0, done.stderr

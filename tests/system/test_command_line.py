@@ -135,7 +135,7 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
     process.send_signal(number)
     said = process.stderr.read()
     process.stderr.close()
-    code = process.wait(30)
+    code = process.wait(60)
     if number is signal.SIGINT:
         assert code == 130
         assert "nothing was written" in said

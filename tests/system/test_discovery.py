@@ -117,7 +117,7 @@ def test_refused_while_a_run_uses_the_devices(daemon: Daemon) -> None:
             rig.discover("grbl")
         assert caught.value.code is Code.BUSY
         rig.abort()
-        run.wait(20, check=False)
+        run.wait(60, check=False)
         with pytest.raises(UmbraError, match="no driver 'grlb'") as caught:
             rig.discover("grlb")
         assert caught.value.code is Code.BAD_REQUEST
@@ -128,7 +128,7 @@ def test_the_command_line(drivers: Daemon) -> None:
         return subprocess.run(
             [sys.executable, "-m", "protocol.cli", "devices", "--rig", drivers.endpoint,
              *arguments],
-            capture_output=True, text=True, timeout=50, check=False,
+            capture_output=True, text=True, timeout=100, check=False,
         )  # fmt: skip
 
     with drivers.start():

@@ -53,6 +53,6 @@ def test_the_daemon_outlives_the_x_server_and_uses_the_next(
             assert daemon.stop() == 0
         finally:
             again.terminate()
-            again.wait(10)
+            again.wait(60)
     finally:
         rig.close()

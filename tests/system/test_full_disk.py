@@ -79,8 +79,8 @@ def test_a_run_that_waits_for_room_can_be_aborted(daemon: Daemon, tiny: Path) ->
         fill(tiny)
         until(lambda: rig.status().state is RigState.PAUSED)
         rig.abort(run.id)
-        info = run.wait(20, check=False)
+        info = run.wait(60, check=False)
         assert info.state is RunState.ABORTED
         (tiny / "ballast").unlink()
         until(lambda: "aborted" in (tiny / "runs" / run.id / "run.json").read_text())
-        assert rig.scan(umbra.TwoImage()).wait(30).state is RunState.DONE
+        assert rig.scan(umbra.TwoImage()).wait(60).state is RunState.DONE

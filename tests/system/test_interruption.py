@@ -129,7 +129,7 @@ def test_two_daemons_do_not_share_a_data_folder(daemon: Daemon) -> None:
     with daemon.start():
         first = daemon.process
         second = daemon.launch()
-        assert second.wait(20) == 1
+        assert second.wait(60) == 1
         daemon.process = first
     assert "data" in daemon.log().splitlines()[-1]
     until(lambda: first is not None and first.poll() is None)

@@ -16,7 +16,7 @@ import umbra
 from drivers.registry import UnknownDriver, load
 from protocol.client import EventStream
 from protocol.errors import Code, UmbraError
-from protocol.messages import PreviewTaken, RigState, RunState
+from protocol.messages import PreviewTaken, RigChanged, RigState, RunState
 from protocol.scans import SingleImage
 from tests.system.harness import Daemon, recorded, until
 
@@ -27,7 +27,7 @@ def coming(events: EventStream, count: int) -> list[tuple[PreviewTaken, dict[str
     """The next previews by hand."""
     seen: list[tuple[PreviewTaken, dict[str, object]]] = []
     while len(seen) < count:
-        notice = events.next(30.0)
+        notice = events.next(60.0)
         assert notice is not None
         assert isinstance(notice.body, PreviewTaken)
         if not notice.body.run:
@@ -58,11 +58,21 @@ def test_pictures_with_what_is_over_exposed(daemon: Daemon) -> None:
 
 
 def test_it_ends_when_nobody_renews_it(daemon: Daemon) -> None:
-    with daemon.start() as rig, rig.subscribe("preview") as events:
+    with (
+        daemon.start() as rig,
+        rig.subscribe("preview") as events,
+        rig.subscribe("rig") as changes,
+    ):
         rig.live(rate_hz=15, lease_s=1.0)
         coming(events, 1)
-        assert rig.status().state is RigState.MANUAL
-        until(lambda: rig.status().state is RigState.IDLE)
+        states: list[RigState] = []
+        while RigState.IDLE not in states:
+            notice = changes.next(60.0)
+            assert notice is not None
+            assert isinstance(notice.body, RigChanged)
+            states.append(notice.body.state)
+        assert states[0] is RigState.MANUAL
+        assert rig.status().state is RigState.IDLE
         assert "nobody asked again" in daemon.log()
 
 
@@ -115,7 +125,7 @@ def test_the_command_line(daemon: Daemon, tmp_path: Path) -> None:
         return subprocess.run(
             [sys.executable, "-m", "protocol.cli", "preview", "--rig", daemon.endpoint, "--live",
              "--rate", "15", *arguments],
-            capture_output=True, text=True, timeout=50, check=False,
+            capture_output=True, text=True, timeout=100, check=False,
         )  # fmt: skip
 
     with daemon.start() as rig:
@@ -150,7 +160,7 @@ def test_a_preview_is_of_now_and_tells_its_age_where_it_is_not(
             [*command, "--json", "-o", str(tmp_path / "a.png")],
             check=True,
             capture_output=True,
-            timeout=60,
+            timeout=100,
         ).stdout
         facts = json.loads(out)["facts"]
         assert facts["age_s"] < 30

@@ -58,7 +58,7 @@ def test_a_second_client_while_a_scan_runs(daemon: Daemon) -> None:
         other.abort(queued.id)
         assert queued.refresh().state is RunState.ABORTED
         other.abort(run.id)
-        info = run.wait(20, check=False)
+        info = run.wait(60, check=False)
         assert info.state is RunState.ABORTED
         assert info.recorded > held.recorded
         until(lambda: other.status().state is RigState.IDLE)
@@ -71,7 +71,7 @@ def test_an_emergency_stop_holds_until_reset(daemon: Daemon) -> None:
         recorded(rig, run.id, 3)
         rig.estop()
         assert rig.status().state is RigState.ESTOPPED
-        info = run.wait(20, check=False)
+        info = run.wait(60, check=False)
         assert info.state is RunState.ABORTED
         assert info.end is not None
         assert info.end.reason == "emergency stop"
@@ -196,7 +196,7 @@ def test_an_abort_is_heard_while_the_camera_hangs(daemon: Daemon) -> None:
         run = rig.scan(umbra.Checkerboard())
         recorded(rig, run.id, 4)
         rig.abort()
-        assert run.wait(20, check=False).state is RunState.ABORTED
+        assert run.wait(60, check=False).state is RunState.ABORTED
         assert rig.scan(umbra.TwoImage()).wait(60).state is RunState.DONE
 
 
@@ -222,7 +222,7 @@ def test_a_full_disk_is_said_before_the_scan(daemon: Daemon) -> None:
     text = daemon.config.read_text().replace("reserve_mb = 1", "reserve_mb = 1000000000")
     daemon.config.write_text(text)
     with daemon.start() as rig:
-        info = rig.scan(umbra.TwoImage()).wait(20, check=False)
+        info = rig.scan(umbra.TwoImage()).wait(60, check=False)
         assert info.end is not None
         assert info.end.code == Code.STORAGE_FULL
         assert info.recorded == 0
@@ -233,12 +233,12 @@ def test_stopping_with_the_parent(daemon: Daemon) -> None:
     with daemon.connect():
         assert process.stdin is not None
         process.stdin.close()
-        assert process.wait(20) == 0
+        assert process.wait(60) == 0
 
 
 def test_a_bad_configuration_exits_with_2(daemon: Daemon) -> None:
     daemon.config.write_text("[camera]\ndriver = 'virtual'\nwdth = 3\n")
-    assert daemon.launch().wait(20) == 2
+    assert daemon.launch().wait(60) == 2
     assert daemon.log().strip() == f"umbrad: {daemon.config}: camera.wdth: there is no such key"
 
 
@@ -249,7 +249,7 @@ def test_an_emergency_stop_before_the_run_has_the_devices(daemon: Daemon) -> Non
         rig.show(umbra.WHITE)
         run = rig.scan(LONG)
         other.estop()
-        info = run.wait(30, check=False)
+        info = run.wait(60, check=False)
         assert info.state is RunState.ABORTED
         assert info.recorded == 0
         assert rig.status().state is RigState.ESTOPPED

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
-import time
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import pytest
@@ -11,7 +14,8 @@ import pytest
 import umbra
 from daemon.frames import FrameStore
 from protocol.errors import UmbraError
-from protocol.messages import RigState, RunState
+from protocol.messages import RigState, RunState, Status
+from protocol.run import Run
 from protocol.scans import Ready
 from tests.system.harness import Daemon, recorded, until
 
@@ -32,7 +36,7 @@ kind = "sun"
 clouds = {clouds}
 """
 NIGHT = [[0, 0.0], [1e6, 0.0]]
-MORNING = [[0, 0.0], [30, 0.02], [36, 1.0], [40, 0.5], [44, 1.0], [1e6, 1.0]]
+MORNING = ((0, 0.0), (30, 0.02), (36, 1.0), (40, 0.5), (44, 1.0))
 MESH: dict[str, Any] = {
     "hole_mm": 12.5, "pitch_mm": 20.0, "source_deg": 0.1, "scene_mm": 150.0, "coverage": 0.9,
     "sun": True,
@@ -57,20 +61,40 @@ def rig_of(daemon: Daemon, run: str) -> dict[str, Any]:
     return dict(found["rig"])
 
 
+def looked(run: Run) -> bool:
+    return run.refresh().state is RunState.WAITING or bool(run.info.started)
+
+
+@contextmanager
+def before_dawn(daemon: Daemon, scan: umbra.Mesh) -> Iterator[tuple[Status, Run]]:
+    """A run that has looked at the light before the morning came, and the rig's status then; where
+    a busy host was too late for that, once more with a morning that takes longer."""
+    for slower in (1, 2, 4):
+        clouds = [[slower * at, level] for at, level in MORNING]
+        with garden(daemon, [*clouds, [1e6, 1.0]]).start() as rig, daemon.connect() as other:
+            run = rig.scan(scan)
+            until(partial(looked, run))
+            status = other.status()
+            waiting = status.progress and status.progress.waits
+            if waiting and waiting.what == "light":
+                yield status, run
+                return
+        daemon.kill()
+        shutil.rmtree(daemon.data)
+    pytest.fail("the morning was always there before the first look")
+
+
 def test_a_scan_waits_for_the_morning_and_for_steady_light(daemon: Daemon) -> None:
     ready = Ready(deadline_s=600.0, light_min=0.3, steady=0.05, look_s=2.0)
-    with garden(daemon, MORNING).start() as rig, daemon.connect() as other:
-        run = rig.scan(umbra.Mesh(**MESH, auto_exposure=True, ready=ready))
-        until(lambda: other.run(run.id).refresh().state is RunState.WAITING)
-        status = other.status()
+    scan = umbra.Mesh(**MESH, auto_exposure=True, ready=ready)
+    with before_dawn(daemon, scan) as (status, run), daemon.connect() as other:
         assert status.state is RigState.WAITING
         assert status.progress is not None
-        waits = status.progress.waits
-        assert waits is not None
-        assert waits.what == "light"
-        assert "at least 30.0% are wanted" in waits.seen
-        assert waits.since < waits.until
-        info = run.wait(60)
+        waiting = status.progress.waits
+        assert waiting is not None
+        assert "at least 30.0% are wanted" in waiting.seen
+        assert waiting.since < waiting.until
+        info = run.wait(120)
         assert info.state is RunState.DONE
         events = [record["what"] for record in other.log(run.id) if record["event"] == "waiting"]
         assert events == ["light", "steadiness"]
@@ -113,19 +137,18 @@ def test_a_wait_can_be_aborted_and_survives_a_kill(daemon: Daemon) -> None:
         rig.resume(run)
         until(lambda: rig.run(run).refresh().state is RunState.WAITING)
         rig.abort(run)
-        began = time.monotonic()
-        assert rig.run(run).wait(10, check=False).state is RunState.ABORTED
-        assert time.monotonic() - began < 10  # and not the next look
+        # The next look is 150 s away: longer than this has patience.
+        assert rig.run(run).wait(60, check=False).state is RunState.ABORTED
         until(lambda: rig.status().state is RigState.IDLE)
 
 
 def test_a_device_that_is_away_is_waited_for(daemon: Daemon) -> None:
     # The first look loses the camera, and connecting fails twice.
     daemon.configure(camera='faults = ["vanish@1*2"]', scale=1)
-    ready = Ready(deadline_s=60.0, light_min=0.01, look_s=30.0)
+    ready = Ready(deadline_s=600.0, light_min=0.01, look_s=300.0)
     with daemon.start() as rig:
         run = rig.scan(umbra.TwoImage(ready=ready))
-        assert run.wait(20).state is RunState.DONE  # its return is heard of, before the next look
+        assert run.wait(60).state is RunState.DONE  # its return is heard of, before the next look
         waited = [(r["what"], r["seen"]) for r in rig.log(run.id) if r["event"] == "waiting"]
         assert [what for what, _ in waited] == ["light", "devices"]
         assert "camera: grab" in waited[0][1]
@@ -140,7 +163,7 @@ def test_a_scan_may_be_queued_while_a_device_is_away(daemon: Daemon) -> None:
         with pytest.raises(UmbraError, match="lost"):
             rig.scan(umbra.TwoImage())
         run = rig.scan(umbra.TwoImage(ready=Ready(deadline_s=1.0)))
-        info = run.wait(20, check=False)
+        info = run.wait(60, check=False)
         assert info.end is not None
         assert "not ready within 1 s: devices never was so" in info.end.reason
 
@@ -197,7 +220,7 @@ def test_a_run_leaves_the_camera_as_it_found_it(daemon: Daemon) -> None:
         run = rig.scan(umbra.Checkerboard(average=32, exposure_us=9000.0))
         recorded(rig, run.id, 3)
         rig.abort(run.id)
-        assert run.wait(20, check=False).state is RunState.ABORTED
+        assert run.wait(60, check=False).state is RunState.ABORTED
         until(lambda: rig.status().state is RigState.IDLE)
         assert rig.camera() == before
 

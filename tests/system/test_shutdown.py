@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import time
 
 import pytest
 
@@ -19,7 +18,7 @@ LONG = umbra.Checkerboard(average=32)
 def test_a_second_signal_hurries(daemon: Daemon) -> None:
     # A hook that takes its time is what an orderly stop waits for.
     daemon.config.write_text(
-        daemon.config.read_text() + '[hooks]\ndone = ["sleep", "25"]\ntimeout_s = 40\n'
+        daemon.config.read_text() + '[hooks]\ndone = ["sleep", "100"]\ntimeout_s = 200\n'
     )
     with daemon.start() as rig:
         run = rig.scan(umbra.TwoImage())
@@ -29,10 +28,8 @@ def test_a_second_signal_hurries(daemon: Daemon) -> None:
     daemon.process.send_signal(signal.SIGTERM)
     until(lambda: '"stopping"' in daemon.log())
     assert daemon.process.poll() is None
-    began = time.monotonic()
     daemon.process.send_signal(signal.SIGINT)
-    assert daemon.process.wait(15) == 0
-    assert time.monotonic() - began < 15
+    assert daemon.process.wait(60) == 0  # the hook is not waited for
     last = daemon.log().splitlines()[-1]
     assert '"stopped in a hurry"' in last
     assert '"safe": true' in last
@@ -47,7 +44,7 @@ def test_a_run_that_was_hurried_can_be_resumed(daemon: Daemon) -> None:
     assert daemon.process is not None
     for _ in range(2):
         daemon.process.send_signal(signal.SIGTERM)
-    assert daemon.process.wait(15) == 0
+    assert daemon.process.wait(60) == 0
     with daemon.start() as rig:
         assert rig.run(run).refresh().state is RunState.INTERRUPTED
         assert rig.run(run).info.recorded >= 20
@@ -74,7 +71,7 @@ def test_the_log_is_published_as_it_is_written(daemon: Daemon) -> None:
         until(lambda: events.next(0.2) is not None or bool(rig.scan(umbra.TwoImage())))
         seen = []
         while "run done" not in seen:
-            notice = events.next(20)
+            notice = events.next(60)
             assert notice is not None
             assert isinstance(notice.body, Logged)
             seen.append(notice.body.record["event"])
@@ -88,7 +85,7 @@ def test_a_paused_rig_says_so(daemon: Daemon) -> None:
         until(lambda: rig.status().state is RigState.PAUSED)
         states = []
         while RigState.PAUSED not in states:
-            notice = events.next(10)
+            notice = events.next(60)
             assert notice is not None
             assert isinstance(notice.body, RigChanged)
             states.append(notice.body.state)

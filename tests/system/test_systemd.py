@@ -33,7 +33,7 @@ def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
         [str(part) for part in command],
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=100,
         check=False,
         stdin=subprocess.DEVNULL,
     )
@@ -193,7 +193,7 @@ class Machine:
 
     def wait_for_boot(self) -> None:
         """Skips the tests where the machine does not let a systemd run."""
-        deadline = time.monotonic() + 15
+        deadline = time.monotonic() + 60
         while time.monotonic() < deadline and self._unshare.poll() is None:
             children = Path(f"/proc/{self._unshare.pid}/task/{self._unshare.pid}/children")
             self.pid = int((children.read_text().split() or ["0"])[0])
@@ -231,7 +231,7 @@ class Machine:
         return int(self.show("MainPID"))
 
     def until(self, what: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 25
+        deadline = time.monotonic() + 90
         while not what():
             assert time.monotonic() < deadline, self.systemctl("status", "umbrad").stdout
             time.sleep(0.05)
@@ -240,7 +240,7 @@ class Machine:
         if self.pid:
             os.kill(self.pid, signal.SIGKILL)  # and with PID 1 all that runs inside
         self._unshare.kill()
-        self._unshare.wait(10)
+        self._unshare.wait(60)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,24 @@
+"""The surroundings of all tests: the same from a terminal, in the background, on a busy host."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+# As many processes as cores run tests, and some start daemons: threads of a linear algebra
+# library would spin for cores that others need. Read where NumPy is first imported, here or there.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def pytest_configure() -> None:
+    """Hear Ctrl-C: what a shell starts in the background ignores it, and so do its children."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of real processes first: they are the longest, and a worker at the end has short ones
+    to share out (`make test` keeps this order)."""
+    items.sort(key=lambda item: item.get_closest_marker("system") is None)

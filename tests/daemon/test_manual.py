@@ -1,0 +1,94 @@
+"""Two people at one bench: what one has done must not end what the other has begun."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+import daemon.manual
+from daemon import config
+from daemon.manual import Manual
+from daemon.rig import Rig
+from daemon.scans.pattern_scan import response_of
+from daemon.snapshot import snap
+from daemon.viewfinder import Viewfinder
+from drivers.base import CameraSettings
+from protocol.patterns import WHITE
+from protocol.scans import Radiometry
+
+RIG = """
+[rig]
+time_scale = 4
+[projector]
+driver = "virtual"
+width = 64
+height = 48
+[camera]
+driver = "virtual"
+width = 64
+height = 48
+faults = ["incomplete-frame@1"]
+"""
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    made = Rig(config.parse(RIG, "test"), lambda _: None)
+    made.connect()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def manual(rig: Rig) -> Manual:
+    return Manual(rig, Viewfinder(lambda _: None), lambda: None, lambda _: None)
+
+
+def meanwhile(monkeypatch: pytest.MonkeyPatch, act: Any) -> None:
+    """Have something done by another while a snap has the camera, once."""
+    acts = [act]
+
+    def taken(*args: Any) -> Any:
+        found = snap(*args)
+        if acts:
+            acts.pop()()
+        return found
+
+    monkeypatch.setattr(daemon.manual, "snap", taken)
+
+
+def test_after_a_snap_the_rig_is_free(manual: Manual) -> None:
+    manual.snap()
+    assert not manual.active
+
+
+def test_a_snap_does_not_end_what_is_shown_meanwhile(
+    manual: Manual, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    meanwhile(monkeypatch, lambda: manual.show(WHITE, 60.0))
+    manual.snap()
+    assert manual.active
+    manual.end()
+
+
+def test_a_snap_does_not_end_another(manual: Manual, monkeypatch: pytest.MonkeyPatch) -> None:
+    def between() -> None:
+        manual.snap()
+        assert manual.active  # the first one still has the camera
+        manual.tend()
+        assert manual.active
+
+    meanwhile(monkeypatch, between)
+    manual.snap()
+    assert not manual.active
+
+
+def test_half_a_picture_chooses_no_exposure(manual: Manual, rig: Rig) -> None:
+    pictures: list[bool] = []
+    manual._viewfinder.offer = lambda frame, *_, **__: pictures.append(frame.incomplete)  # type: ignore[method-assign]
+    response = response_of(Radiometry(), rig.bench())
+    chosen = manual.expose(CameraSettings(), response)
+    assert pictures == [False] * chosen.looks
+    assert not manual.active
