@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +59,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def reprocessor(store: Store, publish: Callable[[AnyEvent], None] = lambda _: None) -> Reprocessor:
-    return Reprocessor(store=store, config=CONFIG, publish=publish)
+    return Reprocessor(store=store, config=CONFIG, publish=publish, busy=lambda: False)
 
 
 def noise(count: int, missing: Iterable[int] = ()) -> Frames:
@@ -143,7 +144,9 @@ def reprocessed(store: Store, run: RunFolder, **changes: Any) -> RunFolder:
 
 
 def executed(store: Store, made: RunFolder) -> None:
-    Reprocessing(made, store=store, on_change=lambda: None, on_progress=lambda _: None).execute()
+    Reprocessing(
+        made, store=store, busy=lambda: False, on_change=lambda: None, on_progress=lambda _: None
+    ).execute()
 
 
 def same(one: RunFolder, other: RunFolder) -> bool:
@@ -452,6 +455,36 @@ def test_a_result_and_progress_are_there_on_the_way(store: Store) -> None:
     told = [event.progress for event in seen if isinstance(event, Progressed)]
     assert (told[-1].recorded, told[-1].planned, told[-1].fraction) == (27, 27, 1.0)
     assert isinstance(found.result(), Components)
+
+
+class Waits(threading.Event):
+    """Somebody who is asked to wait, does not, and remembers for how long."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seconds: list[float] = []
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.seconds.append(timeout or 0.0)
+        return False
+
+
+def test_it_gives_way_while_a_scan_is_under_way(store: Store) -> None:
+    parent = parent_of(store, Checkerboard(checker=4, shift=2), noise(27))
+    answers = [True] * 10 + [False] * 17
+    made = reprocessor(store).submit(asked(parent), "me", "")
+    slow = Reprocessing(
+        made,
+        store=store,
+        busy=lambda: answers.pop(0),
+        on_change=lambda: None,
+        on_progress=lambda _: None,
+    )
+    slow.control.news = Waits()
+    assert slow.execute().state is RunState.DONE
+    assert len(slow.control.news.seconds) == 10
+    assert min(slow.control.news.seconds) > 0
+    assert same(parent, made)
 
 
 def test_a_parent_is_kept_for_as_long_as_it_is_needed(store: Store) -> None:

@@ -104,9 +104,7 @@ def test_a_rolling_shutter(daemon: Daemon) -> None:
                     good(rig.scan(umbra.Checkerboard(mode=mode, exposure_us=exposure)))
             else:
                 scan = umbra.Checkerboard(mode="hardware", exposure_us=exposure)
-                info = rig.scan(scan).wait(60, check=False)
-                assert info.state is RunState.FAILED  # never a wrong result
-                assert info.missing == 27
+                good(rig.scan(scan))  # never a wrong result: at half the pace nothing is torn
                 assert "torn" in daemon.log()
         daemon.stop()
 
