@@ -22,7 +22,7 @@ from daemon.quality import BITS, Bit
 from daemon.separation.finish import ADVICE
 from daemon.store import RunFile
 from protocol.messages import Product
-from protocol.scans import PatternScan
+from protocol.scans import AnyScan, PatternScan
 
 _ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a line of advice
 _DIM_BELOW = 0.25  # of full scale: a scene that uses less than this is under-exposed
@@ -283,7 +283,6 @@ def _pace(records: Sequence[FrameRecord]) -> str:
 
 
 def _settings(subject: Subject) -> Iterable[tuple[str, Any]]:
-    spec = msgspec.to_builtins(subject.file.spec)
     first = next((r for r in subject.records if not r.missing), None)
     if first:
         if first.exposure_us:
@@ -296,10 +295,20 @@ def _settings(subject: Subject) -> Iterable[tuple[str, Any]]:
     yield from in_step(subject.file)
     known = {"method", "note", "exposure_us", "gain", "lit_fraction", "estimator", "radiometry"}
     known.add("mode")
-    for key, value in spec.items():
-        if key not in known and value is not None:
-            yield key, value
+    yield from ((key, value) for key, value in _told(subject.file.spec) if key not in known)
     yield "pictures show as white", f"{subject.white:.4g} counts"
+
+
+def _told(spec: AnyScan) -> Iterable[tuple[str, Any]]:
+    """A spec's fields that have a value; of what has fields of its own, those that were given."""
+    for key, value in msgspec.to_builtins(spec).items():
+        if isinstance(value, dict) and key != "radiometry":
+            unchanged = msgspec.to_builtins(type(getattr(spec, key))())
+            yield from (
+                (f"{key}: {name}", part) for name, part in value.items() if part != unchanged[name]
+            )
+        elif value is not None:
+            yield key, value
 
 
 def in_step(file: RunFile) -> Iterable[tuple[str, Any]]:
@@ -312,9 +321,8 @@ def in_step(file: RunFile) -> Iterable[tuple[str, Any]]:
 
 def asked(file: RunFile) -> Iterable[tuple[str, Any]]:
     """What a run was told."""
-    for key, value in msgspec.to_builtins(file.spec).items():
-        if key not in {"method", "note", "points"} and value is not None:
-            yield key, value
+    unsaid = {"method", "note", "points"}
+    yield from ((key, value) for key, value in _told(file.spec) if key not in unsaid)
     yield from file.rig.get("settings", {}).items()
 
 

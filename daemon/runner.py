@@ -319,7 +319,7 @@ class Runner:
 
     def move(self, run: str, to: int) -> list[RunFolder]:
         """Put a waiting run at another place; gives the new queue."""
-        moved = self._waiting(run)
+        moved = self._waiting(run, "moved in the queue")
         rest = [r for r in self._store.queued() if r.id != moved.id]
         rest.insert(min(to, len(rest)), moved)
         for order, waiting in enumerate(rest):
@@ -381,7 +381,7 @@ class Runner:
         with self._choosing:
             if (current := self.abort_current(run, by)) is not None:  # it has begun meanwhile
                 return current
-            waiting = self._waiting(run)
+            waiting = self._waiting(run, "aborted")
             end = End(state=RunState.ABORTED, reason="taken from the queue", by=by)
             waiting.update(state=RunState.ABORTED, end=end, ended=utc_now())
         self._queue_changed(waiting)
@@ -395,10 +395,10 @@ class Runner:
             raise UmbraError(Code.WRONG_STATE, "no run is under way")
         return course
 
-    def _waiting(self, run: str) -> RunFolder:
+    def _waiting(self, run: str, done: str) -> RunFolder:
         folder = self._store.open(run)
         if folder.file.state is not RunState.QUEUED:
-            raise self._wrong_state(folder, "moved or taken from the queue")
+            raise self._wrong_state(folder, done)
         return folder
 
     def _wrong_state(self, run: RunFolder, done: str) -> UmbraError:

@@ -25,6 +25,7 @@ import msgspec
 
 from protocol import messages as m
 from protocol.connection import Ask, checked, expect
+from protocol.errors import Code, UmbraError
 from protocol.messages import CameraSettings, RunInfo, RunState
 from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.results import (
@@ -40,7 +41,7 @@ from protocol.results import (
     separation_of,
     stage_of,
 )
-from protocol.scans import AnyScan, SingleImage
+from protocol.scans import AnyScan, SingleImage, Spec
 
 if TYPE_CHECKING:
     from protocol.aio import AsyncClient
@@ -138,6 +139,12 @@ class Commands:
     @command
     def submit(self, spec: AnyScan, *, first: bool = False) -> Ask[RunInfo]:
         """Queue a scan, ahead of the others if `first`; comes back at once. `scan` gives a Run."""
+        if not isinstance(spec, Spec):
+            raise UmbraError(
+                Code.BAD_REQUEST,
+                f"{spec!r} is no scan: say what to scan by a struct of umbra's, such as "
+                "umbra.Checkerboard(checker=8)",
+            )
         return Ask(m.Submit(spec=spec, by=self.name, first=first), run_of)
 
     @command
@@ -245,12 +252,20 @@ class Commands:
     ) -> Ask[str]:
         """Show a pattern by hand; the projector goes dark after `lease_s`."""
         if isinstance(pattern, str):
-            pattern = {"white": WHITE, "black": BLACK}[pattern]
+            named = {"white": WHITE, "black": BLACK}.get(pattern)
+            if named is None:
+                raise UmbraError(
+                    Code.BAD_REQUEST,
+                    f"no pattern is called {pattern!r}: it is white, black, or a pattern such as "
+                    "umbra.Checker(size=8)",
+                )
+            pattern = named
         return Ask(m.Show(pattern=pattern, lease_s=lease_s), message_of)
 
     @command
     def snap(self, *, png: bool = False, demosaic: bool = True) -> Ask[Picture]:
-        """Take one frame as things are: native depth, or the bytes of a PNG file."""
+        """Take one frame as things are: native depth, a mosaic as it is; or the bytes of a PNG
+        file, in colours unless `demosaic` is false."""
         return Ask(m.Snap(png=png, demosaic=demosaic), picture_of("frame", "png"), SLOW_S)
 
     @command

@@ -74,6 +74,14 @@ NAMES: tuple[str, ...] = tuple(method.name for method in _METHODS.values())
 
 def method_for(spec: AnyScan, bench: Bench) -> Method[Any]:
     """The method of a scan, checked against the rig. Raises Unsuitable."""
+    shortest, longest = bench.camera.exposure_range_us
+    asked = spec.exposure_us
+    stated = asked is not None and not spec.auto_exposure and not bench.camera.recorded
+    if stated and longest and not shortest <= asked <= longest:  # type: ignore[operator]
+        raise Unsuitable(
+            f"the camera exposes for {shortest:g} to {longest:g} µs, not for {asked:g}",
+            "$.exposure_us",
+        )
     try:
         made = _METHODS[type(spec)]
     except KeyError:
