@@ -39,7 +39,7 @@ from daemon.server import Server
 from daemon.store import Store
 from daemon.viewfinder import Glimpse, Viewfinder
 from protocol.errors import UmbraError
-from protocol.messages import AnyEvent, DeviceChanged, DeviceInfo, Logged, PreviewTaken
+from protocol.messages import AnyEvent, DeviceChanged, DeviceInfo, Logged, PreviewTaken, RigState
 
 _TEND_S = 1.0
 _SWITCH_S = 0.0005
@@ -147,7 +147,12 @@ class _Daemon:
                 on_activity=changed,
                 make_way=manual.make_way,
             )
-            reprocessor = Reprocessor(store=store, config=self._config, publish=publish)
+            reprocessor = Reprocessor(
+                store=store,
+                config=self._config,
+                publish=publish,
+                busy=lambda: commands.state is RigState.SCANNING,
+            )
             commands = Commands(
                 rig=rig,
                 runner=runner,

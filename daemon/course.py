@@ -23,7 +23,7 @@ from daemon.config import RigConfig
 from daemon.control import Control
 from daemon.devicethread import Revoked, Session
 from daemon.durable import StorageError
-from daemon.ending import close, end_of, utc_now, with_exposure
+from daemon.ending import close, end_of, of_lost, utc_now, with_exposure
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.exposer import Behind
 from daemon.exposing.modes import Choice, Mode, choose
@@ -390,9 +390,14 @@ class Course:
         self.standing.update(state=RunState.FINISHING)
         self.standing.say("writing products")
         began = time.monotonic()
-        result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
-        self._timings["separate_s"] = time.monotonic() - began
         lost = recorder.lost_patterns
+        try:
+            result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
+        except NotYet:
+            if lost:
+                raise UmbraError(Code.FRAMES_MISSING, f"{of_lost(lost)}: scan again") from None
+            raise
+        self._timings["separate_s"] = time.monotonic() - began
         made = products.write(
             self.folder,
             result,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -34,17 +34,23 @@ def with_exposure(result: Result, rig: Mapping[str, Any]) -> Result:
     return replace(result, facts=facts)
 
 
-def end_of(lost: Sequence[int], reason: str) -> End:
-    """The end of a run whose products are made; `lost` are patterns that it has no frame of."""
+def end_of(lost: Mapping[int, str], reason: str) -> End:
+    """The end of a run whose products are made; `lost` are patterns that it has no frame of, and
+    why."""
     if not lost:
         return End(state=RunState.DONE, reason=reason)
     return End(
         state=RunState.FAILED,
         code=Code.FRAMES_MISSING,
-        reason=f"no frame could be had of {len(lost)} of the patterns "
-        f"({', '.join(str(n) for n in lost[:8])}{' ...' if len(lost) > 8 else ''}); "
-        "the products are made without them",
+        reason=f"{of_lost(lost)}; the products are made without them",
     )
+
+
+def of_lost(lost: Mapping[int, str]) -> str:
+    """Which patterns have no frame, and why, for people."""
+    some = ", ".join(str(n) for n in list(lost)[:8]) + (" ..." if len(lost) > 8 else "")
+    why = list(lost.values())[-1]
+    return f"no frame could be had of {len(lost)} of the patterns ({some}): {why}"
 
 
 def close(folder: RunFolder, end: End, timings: Mapping[str, float]) -> None:

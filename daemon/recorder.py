@@ -116,7 +116,7 @@ class Recorder:
         self._taken_in = 0  # ... in the estimator
         self._changed = threading.Condition()
         self._concluding = threading.Lock()  # once the separator has ended anybody may ask
-        self._missing_patterns: set[int] = set()
+        self._missing_patterns: dict[int, str] = {}  # and why, last
         self._seen_patterns: set[int] = set()
         self._incoming: queue.Queue[Exposed | None] = queue.Queue(maxsize=ring.count + 1)
         self._accepted: queue.Queue[tuple[Exposed, FrameRecord] | Future[Result] | None] = (
@@ -144,7 +144,7 @@ class Recorder:
             position = (record.step, record.sub + 1)
             if record.missing:
                 missing += 1
-                self._missing_patterns.add(record.observation.pattern)
+                self._missing_patterns[record.observation.pattern] = record.missing
                 continue
             scratch = self._frames.read(record.index, out=scratch)
             self._method.recall(scratch, record.observation)
@@ -188,9 +188,10 @@ class Recorder:
         return self._summary
 
     @property
-    def lost_patterns(self) -> tuple[int, ...]:
-        """Patterns of which no frame could be had."""
-        return tuple(sorted(self._missing_patterns - self._seen_patterns))
+    def lost_patterns(self) -> dict[int, str]:
+        """Patterns of which no frame could be had, and why."""
+        missing = sorted(self._missing_patterns.items())
+        return {pattern: why for pattern, why in missing if pattern not in self._seen_patterns}
 
     def finish(self) -> None:
         """Wait until everything is durable and taken in; the workers end. Raises their failure."""
@@ -341,7 +342,7 @@ class Recorder:
             exposed, record = item
             tally = self._tally
             if exposed.frame is None:
-                self._missing_patterns.add(record.observation.pattern)
+                self._missing_patterns[record.observation.pattern] = record.missing
                 self._tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
             else:
                 self._estimator.update(exposed.frame.pixels, record.observation)

@@ -5,7 +5,8 @@
 What the parent recorded is only read: pixels with their checksums, and what each frame was used
 for. Where nothing changes the result is therefore the parent's, bit for bit. The new run keeps its
 own frames.jsonl, for frames may be used differently in it, and no pixels. It is as quick as the
-disk and the estimator, so an interruption is not gone on with: it begins anew.
+disk and the estimator, so an interruption is not gone on with: it begins anew. While a scan is
+under way it takes a quarter of its time, for a scan's frames cannot wait.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ from protocol.scans import AnyScan, Mesh
 
 _PROGRESS_S = 0.1
 _RATE_FRAMES = 20
+_SHARE = 0.25
+"""Of its thread's time while a scan is under way: the scan's frames cannot wait, these can."""
 _GROUP_FRAMES = 256
 """Records that are made durable together: a crash costs nothing, for all of it is done again."""
 
@@ -57,10 +60,13 @@ class Reprocessing:
         folder: RunFolder,
         *,
         store: Store,
+        busy: Callable[[], bool],
         on_change: Callable[[], None],
         on_progress: Callable[[Progress], None],
     ) -> None:
+        """`busy` says whether a scan is under way, which is to be left the machine."""
         self.folder = folder
+        self._busy = busy
         self.control = Control()
         self._store = store
         self._on_change = on_change
@@ -131,7 +137,7 @@ class Reprocessing:
     def _execute(self) -> End:
         began = time.monotonic()
         file = self.folder.file
-        source = self._store.open(file.parents[-1])
+        source = source_of(self.folder, self._store)
         method, again = method_of(file, source.file)
         self._update(state=RunState.RUNNING, started=utc_now(), ended="", end=None)
         self._say("reading the frames of " + source.id)
@@ -167,8 +173,9 @@ class Reprocessing:
 
     def _take_in(
         self, frames: FrameStore, own: FrameStore, method: Method[Any], *, again: bool
-    ) -> tuple[int, ...]:
-        """Every frame, in order, into a fresh estimator; gives the patterns that have none."""
+    ) -> dict[int, str]:
+        """Every frame, in order, into a fresh estimator; gives the patterns that have none, and
+        why."""
         estimator = method.estimator()
 
         def conclude() -> Result:
@@ -176,10 +183,11 @@ class Reprocessing:
                 result = estimator.result()
             return method.conclude(result) if isinstance(result, Components) else result
 
-        missing, seen = set[int](), set[int]()
+        missing, seen = dict[int, str](), set[int]()
         scratch = None
         at: tuple[int, Step] | None = None
-        for record in frames.records():
+        for record in frames.records()[: len(frames)]:  # it may be resumed meanwhile
+            began = time.monotonic()
             if self.control.verdict is not None:
                 raise _Ended
             if at is None or record.step != at[0]:
@@ -187,7 +195,7 @@ class Reprocessing:
             step = at[1]
             tally = self._tally
             if record.missing:
-                missing.add(record.observation.pattern)
+                missing[record.observation.pattern] = record.missing
                 method.observe(step, _taken(record, None))  # as when it did not come
                 own.append_missing(record)
                 self._tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
@@ -212,10 +220,16 @@ class Reprocessing:
             if len(own) % _GROUP_FRAMES == 0:
                 own.commit()
             self._taken()
+            self._give_way(time.monotonic() - began)
         own.commit()
-        return tuple(sorted(missing - seen))
+        return {pattern: why for pattern, why in sorted(missing.items()) if pattern not in seen}
 
-    def _finish(self, bench: Bench, source: RunFolder, lost: tuple[int, ...]) -> End:
+    def _give_way(self, took_s: float) -> None:
+        """After a frame that took so long: beside a scan, leave it the rest of the time."""
+        if self._busy():
+            self.control.news.wait(took_s * (1.0 / _SHARE - 1.0))  # an end is not waited for
+
+    def _finish(self, bench: Bench, source: RunFolder, lost: dict[int, str]) -> End:
         file = self.folder.file
         if self._conclude is None:
             raise UmbraError(Code.NO_RESULT, f"{source.id} has no frames: scan again")

@@ -1,9 +1,9 @@
 """The runs that are made from others, one at a time, beside the queue of scans.
 
 Beside it, for they need no devices: a rig without its camera, or with hours of scans before it,
-must not keep anybody from correcting a number. One at a time, so that they take one core and one
-estimator's memory, whatever is asked for. They begin in the order in which they were submitted,
-also after a restart.
+must not keep anybody from correcting a number. One at a time, so that they take one estimator's
+memory, whatever is asked for; and slowly beside a scan (`daemon.reprocessing`). They begin in the
+order in which they were submitted, also after a restart.
 """
 
 from __future__ import annotations
@@ -41,8 +41,11 @@ class Reprocessor:
         store: Store,
         config: RigConfig,
         publish: Callable[[AnyEvent], None],
+        busy: Callable[[], bool],
     ) -> None:
-        """`publish` must be safe to call from any thread."""
+        """`publish` must be safe to call from any thread, and so must `busy`, which says whether a
+        scan is under way."""
+        self._busy = busy
         self._store = store
         self._config = config
         self._publish = publish
@@ -74,6 +77,7 @@ class Reprocessor:
         self._current = Reprocessing(
             run,
             store=self._store,
+            busy=self._busy,
             on_change=lambda: self._publish(RunChanged(run=run.info())),
             on_progress=lambda p: self._publish(Progressed(progress=p)),
         )

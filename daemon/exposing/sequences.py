@@ -9,8 +9,10 @@ That frame k shows image k is proven three times: there are exactly as many fram
 lost on its way, one period apart by the camera's own clock (drivers.sequence); the white and the
 black image at its head look bright and dark, so that the light is not a period late or early; and
 each frame looks like its pattern (daemon.proof). Frames are handed on only when all of it holds.
-Otherwise the whole sequence is run again, `attempts` times in all; then each of its frames is an
-explicit missing record. When no pulse ever gave a frame, the run fails: that is wiring.
+Otherwise the whole sequence is run again, `attempts` times in all, each at half the pace of the one
+before, for a host that cannot take frames as fast as its camera gives them loses some; then each of
+its frames is an explicit missing record. When no pulse ever gave a frame, the run fails: that is
+wiring.
 
 A pause calls a sequence off at once, and it is run again after it; so does a resumed run begin at
 the first frame that was not recorded. A step that no sequence can hold (a dark projector, a delay,
@@ -57,6 +59,7 @@ IMAGES_BYTES = 256 << 20
 """Memory that the images of a sequence may take."""
 _LOAD_S = 30.0
 _START_S = 1.0  # from `run` to the first pulse, beyond a frame's own deadline
+_SLOWEST = 8  # times the shortest period: slower than that, nobody loses frames for want of time
 _BEYOND = 1.5  # periods after the last frame in which none may come
 
 log = structlog.get_logger(__name__)
@@ -92,6 +95,7 @@ class Sequences(Exposer):
         self._limits: SequenceLimits = limits
         self._most = limits.images  # fewer once the projector has refused so many
         self._ahead: tuple[tuple[int, int], list[_Shot]] | None = None
+        self._slower = 1  # periods are so many times as long as they need be
         self._told: set[str] = set()  # why steps are exposed by themselves
 
     def settle(self) -> None:
@@ -157,7 +161,14 @@ class Sequences(Exposer):
 
     def _pace(self, step: Expose) -> Pace:
         exposure_us = step.exposure_us or self._its.first_exposure_us or 0.0
-        return pace(self._its.info, self._limits, exposure_us, self._its.patience.period_us)
+        info = self._its.info
+        wanted = pace(info, self._limits, exposure_us, self._its.patience.period_us)
+        if self._slower == 1:
+            return wanted
+        try:
+            return pace(info, self._limits, exposure_us, self._slower * wanted.period_us)
+        except Unsuitable:
+            return wanted  # it is as slow as it can be
 
     def _has_levels(self, image: NDArray[np.uint8]) -> bool:
         """Whether sequences have the image's levels."""
@@ -230,7 +241,9 @@ class Sequences(Exposer):
                     problem=problem,
                 )
                 if attempt < its.patience.attempts:
+                    self._slower = min(2 * self._slower, _SLOWEST)
                     its.acquire(Acquisition.HARDWARE)
+                    loaded = self._load([*guards, *shots])
             if not found:
                 raise self._nothing_came(loaded)
             for shot in shots:

@@ -33,6 +33,7 @@ _SECOND_DIFFERENCE_NORM = 6.0  # what it makes of independent samples of deviati
 _BLOCK = 16
 _QUIET = 0.91  # of pure noise, what the quietest fifth of such blocks has
 _BLOCKS = 12  # blocks that make a level's deviation
+_CUT = 0.05  # of a block's samples at an end of the scale: its median difference has less noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,8 +164,9 @@ def from_picture(counts: Plane, full_scale: int, step: int = 1) -> Noise:
     smooth.
 
     Textured blocks say too much, so that at each level the quietest fifth of the blocks speaks: an
-    upper bound in a scene that is textured everywhere. `step` is the distance of samples of one
-    colour (2 in a mosaic). Never less than the rounding of counts.
+    upper bound in a scene that is textured everywhere. Blocks at either end of the scale are left
+    out, for noise is cut off there. `step` is the distance of samples of one colour (2 in a
+    mosaic). Never less than the rounding of counts.
     """
     plane = np.ascontiguousarray(counts[::step, ::step])
     height, width = (n // _BLOCK for n in plane.shape)
@@ -172,12 +174,15 @@ def from_picture(counts: Plane, full_scale: int, step: int = 1) -> Noise:
         return Noise((0.0, float(full_scale)), (_ROUNDING, _ROUNDING))
     second = np.abs(cv2.filter2D(plane, -1, _SECOND_DIFFERENCE, borderType=cv2.BORDER_REFLECT))
 
-    def by_block(values: Plane) -> Plane:
+    def by_block(values: NDArray[Any]) -> NDArray[Any]:
         tiles = values[: height * _BLOCK, : width * _BLOCK]
         tiles = tiles.reshape(height, _BLOCK, width, _BLOCK).transpose(0, 2, 1, 3)
-        return np.asarray(np.median(tiles.reshape(height * width, -1), axis=1))
+        return tiles.reshape(height * width, -1)
 
-    spread, level = by_block(np.asarray(second, dtype=np.float32)), by_block(plane)
+    cut = by_block((plane <= 0) | (plane >= full_scale)).mean(axis=1) > _CUT
+    whole = ~cut if not cut.all() else cut
+    spread = np.median(by_block(np.asarray(second, dtype=np.float32))[whole], axis=1)
+    level = np.median(by_block(plane)[whole], axis=1)
     order = np.argsort(level, kind="stable")
     levels, deviations = [], []
     for group in np.array_split(order, min(max(order.size // _BLOCKS, 1), 8)):

@@ -26,6 +26,8 @@ RANKS = 3
 _PLACES = 8192  # pixels that are looked at for blur and noise
 _GROUPS = 8
 _LEAST = 32  # pixels that make a group
+_DIM = 0.2  # of the brightest pixels' step: with less, a pixel is not looked at
+_WITHIN = 1.5  # times the distance of the kept ranks from an end of the scale, to be clear of it
 _FINE = 640  # ratios of noise and step that are told apart, evenly in their logarithm
 _TINY = np.float32(1e-6)
 
@@ -74,7 +76,7 @@ class OrderStatistics:
     ) -> Explained:
         """The blur and the noise that explain how far apart ranks are: `low` and `high` are light,
         (keep, places), the most extreme first."""
-        groups = None if self.keep < RANKS else _grouped(low, high)
+        groups = None if self.keep < RANKS else _grouped(low, high, response)
         if groups is None:
             return Explained(self._models[0], None, noise.told())
         own = noise.own()
@@ -101,7 +103,7 @@ class OrderStatistics:
             kinds = np.stack([typical * np.sqrt(1.0 - shot + shot * grown) for shot in _SHOT])
         relative = np.maximum(kinds, 1e-3) / of.steps[:, None]
         blur, _, kind, amount = fit(
-            self._models, of.gaps, relative, known=told.measured, even=self._even
+            self._models, of.gaps, relative, known=told.measured, even=self._even, used=of.used
         )
         # what more there is where patterns are uneven is global light, the same in a repeated scan
         uneven = 1.0 if self._even else max(amount, 1.0)
@@ -111,18 +113,21 @@ class OrderStatistics:
 @dataclass(frozen=True, slots=True)
 class _Groups:
     """Pixels alike in step: the mean distances of their ranks (groups, 2, keep - 1) by the raw step
-    (groups); light of lit and unlit samples (groups, 2), and half-way between."""
+    (groups); light of lit and unlit samples (groups, 2), half-way between, and which of the two
+    (groups, 2) have all of their noise."""
 
     gaps: NDArray[np.float64]
     steps: NDArray[np.float64]
     light: NDArray[np.float64]
     middle: Plane
+    used: NDArray[np.bool_]
 
 
-def _grouped(low: Plane, high: Plane) -> _Groups | None:
+def _grouped(low: Plane, high: Plane, response: Response) -> _Groups | None:
     """Groups of the pixels whose ranks (keep, places) these are; None of too few."""
     step = high[:2].mean(axis=0) - low[:2].mean(axis=0)
-    lit = np.flatnonzero(step > np.quantile(step, 0.1))
+    tenth, most = np.quantile(step, [0.1, 0.9])
+    lit = np.flatnonzero(step > max(float(tenth), _DIM * float(most)))
     groups = np.array_split(lit[np.argsort(step[lit], kind="stable")], _GROUPS)
     groups = [group for group in groups if group.size >= _LEAST]
     if not groups:
@@ -132,7 +137,19 @@ def _grouped(low: Plane, high: Plane) -> _Groups | None:
     gaps = np.stack([apart[:, :, g].mean(axis=2) for g in groups]) / steps[:, None, None]
     light = np.stack([[np.median(end[g]) for end in (high[1], low[1])] for g in groups])
     middle = np.asarray(light.mean(axis=1), dtype=np.float32)
-    return _Groups(gaps.astype(np.float64), steps, light.astype(np.float64), middle)
+    # light at an end of the scale has its noise cut off there, and says nothing of it
+    ends = response.linear_between(np.array([response.saturated_from, 0.0], dtype=np.float32))
+    used = np.abs(light - ends) > _WITHIN * gaps[:, :, -1] * steps[:, None]
+    if not used.any():
+        used[:] = True
+    there = used.any(axis=1)
+    return _Groups(
+        gaps[there].astype(np.float64),
+        steps[there],
+        light[there].astype(np.float64),
+        middle[there],
+        used[there],
+    )
 
 
 _LOG = np.log(RATIOS)

@@ -134,6 +134,7 @@ def fit(
     *,
     known: bool = False,
     even: bool = True,
+    used: NDArray[np.bool_] | None = None,
 ) -> tuple[int, NDArray[np.float64], int, float]:
     """The blur (an index of BLURS) and the noise that explain observed gaps.
 
@@ -141,11 +142,14 @@ def fit(
     and of the unlit over the raw step, as it may depend on their light; how much of it there is, is
     found, starting from 1 times. Blur spreads the ranks ever wider, noise the first ones most, and
     blur in proportion to the step, so that the two are told apart; where hardly, the 1 decides,
-    more so if `known`, less so if patterns do not light every neighbourhood alike (`even`).
+    more so if `known`, less so if patterns do not light every neighbourhood alike (`even`). `used`
+    (groups, 2), at least one a group: which gaps count (None: all).
 
     Returns the noise over the step (groups, 2), its kind, and how much of it there is.
     """
-    size = (gaps**2).sum(axis=(1, 2))  # misfits are relative to it, for each group to have its say
+    share = np.ones(gaps.shape[:2]) if used is None else used.astype(np.float64)
+    # misfits are relative to it, for each group to have its say
+    size = np.einsum("gek,ge->g", gaps**2, share)
     log = np.log(RATIOS)
     away = np.log(_AMOUNTS)
     loud = min(float(np.median(noise)) / _LOUD, 1.0)
@@ -160,11 +164,12 @@ def fit(
         table = np.stack(
             [np.interp(_FINE, log, column) for column in model.gaps.reshape(log.size, -1).T], axis=1
         ).reshape(_FINE.size, *gaps.shape[1:])
-        misfit = ((gaps[:, None] - table[None]) ** 2).sum(axis=3) / size[:, None, None]
+        misfit = ((gaps[:, None] - table[None]) ** 2).sum(axis=3)
+        misfit *= (share / size[:, None])[:, None]
         raw = _FINE - np.log(np.interp(_FINE, log, model.step))
         place = np.interp(wanted, raw, np.arange(raw.size))
         cost = misfit[group, np.rint(place).astype(np.intp), end].sum(axis=3)
-        cost += 2.0 * prior[:, None]  # (kinds, amounts, groups)
+        cost += prior[:, None] * share.sum(axis=1)  # (kinds, amounts, groups)
         if even:
             kind, amount = (
                 int(n) for n in np.unravel_index(int(np.argmin(cost.sum(axis=2))), cost.shape[:2])

@@ -59,7 +59,7 @@ def test_calls_are_made_by_one_thread_in_order(lamp: DeviceThread[Lamp]) -> None
     ran: list[int] = []
     futures = [lamp.submit(lambda _, n=n: ran.append(n), 1) for n in range(20)]  # type: ignore[misc]
     for future in futures:
-        future.result(5)
+        future.result(60)
     assert ran == list(range(20))
     assert lamp.call(lambda _: threading.current_thread().name, 1) == "umbra-lamp"
 
@@ -76,15 +76,15 @@ def test_an_error_travels_to_the_caller(lamp: DeviceThread[Lamp]) -> None:
 def test_what_a_revoked_session_asked_for_does_not_happen(lamp: DeviceThread[Lamp]) -> None:
     session = Session("run 1")
     blocked = lamp.submit(Lamp.block, 5, session)
-    assert lamp.device.entered.wait(5)
+    assert lamp.device.entered.wait(60)
     late = lamp.submit(lambda d: d.set(True), 5, session)
     session.revoke()
     safe = lamp.submit(Lamp.safe, 5)
     lamp.device.halt()
-    blocked.result(5)
-    safe.result(5)
+    blocked.result(60)
+    safe.result(60)
     with pytest.raises(Revoked):
-        late.result(5)
+        late.result(60)
     assert lamp.device.acts == ["halt", "safe"]
 
 

@@ -219,6 +219,27 @@ def test_after_the_last_frame_it_is_dark(stand: Stand, mode: Mode) -> None:
     assert not stand.session.ended.is_set()
 
 
+@pytest.mark.parametrize(
+    "stand",
+    [{"camera": 'faults = ["drop-trigger@5", "drop-trigger@20"]', "ring": 32}],
+    indirect=True,
+)
+def test_a_sequence_that_loses_frames_is_run_again_more_slowly(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    projector = cast(Any, stand.rig.projector).device
+    load, periods = projector.load, list[float]()
+
+    def loaded(images: Any, exposure_us: float, period_us: float) -> Any:
+        periods.append(period_us)
+        return load(images, exposure_us, period_us)
+
+    monkeypatch.setattr(projector, "load", loaded)
+    run(stand, Mode.HARDWARE)
+    assert [p / periods[0] for p in periods] == pytest.approx([1, 2, 4])
+    assert all(e.frame is not None for e in stand.tape.taken)
+
+
 @pytest.mark.parametrize("stand", [{"camera": 'faults = ["incomplete-frame@1"]'}], indirect=True)
 def test_each_look_at_the_light_is_a_sign_of_life(stand: Stand) -> None:
     # Ten long ones, each tried again, are more than the watchdog waits for.

@@ -17,13 +17,13 @@ def test_a_check_that_is_older_than_the_loss_says_nothing() -> None:
         member.next_try = 0.0
         rig.tend()  # asks for a sign of life
         assert member.pending is not None
-        member.pending.result(10)  # and has it, but has not looked at it
+        member.pending.result(60)  # and has it, but has not looked at it
         rig.failed(DeviceLost("camera", "grab", "gone"))
         rig.tend()
         assert [d.health for d in rig.devices() if d.name == "camera"] == [Health.LOST]
         rig.tend()  # connects again
         assert member.pending is not None
-        member.pending.result(10)
+        member.pending.result(60)
         rig.tend()
         assert [d.health for d in rig.devices() if d.name == "camera"] == [Health.READY]
         assert [i.health for i in told if i.name == "camera"] == [

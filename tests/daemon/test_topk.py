@@ -10,7 +10,7 @@ from daemon.separation.order_estimate import KEEP
 from daemon.separation.order_model import BLURS, RATIOS, fit, simulate
 from daemon.separation.radiometry import Response
 from daemon.separation.topk import TopK
-from protocol.scans import AnyScan, Checkerboard, RandomBinary
+from protocol.scans import AnyScan, Checkerboard, Radiometry, RandomBinary
 from tests.daemon.scene import FULL, Scene
 
 NONE: tuple[()] = ()
@@ -44,6 +44,18 @@ def test_the_bias_of_max_min_is_gone(
     assert abs(ranked[0]) < 0.3 * sigma
     assert abs(ranked[2]) < 0.35 * sigma
     assert ranked[1] < paper[1]
+
+
+@pytest.mark.parametrize("sigma", [0.002, 0.005])
+def test_a_black_background_whose_noise_is_cut_off_says_nothing_of_noise(sigma: float) -> None:
+    scene = Scene(sigma=sigma, leakage=0.06)
+    y, x = np.mgrid[: scene.height, : scene.width]
+    thing = ((y - 48) / 44.0) ** 2 + ((x - 64) / 56.0) ** 2 < 1
+    scene.albedo_direct = scene.albedo_direct * thing * 0.7
+    scene.albedo_global = scene.albedo_global * thing * 0.7
+    spec = Checkerboard(references=NONE, radiometry=Radiometry(leakage=0.06))
+    error = ((scene.scan(spec).direct - scene.direct) / FULL)[thing]
+    assert abs(float(error.mean())) < 0.2 * sigma
 
 
 def test_what_blur_takes_is_given_back() -> None:

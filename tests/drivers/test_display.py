@@ -159,7 +159,7 @@ def test_the_process_ends_with_the_one_that_started_it(
         assert process is not None
         projector._calls.close()  # as when the daemon is killed
         projector._calls = None
-        assert process.wait(5) == 0
+        assert process.wait(60) == 0
 
 
 def test_without_any_display_the_remedy_is_named(make: Callable[..., DisplayProjector]) -> None:

@@ -62,7 +62,7 @@ def homed(stage: TmclStage) -> TmclStage:
 
 
 def pump_until(stage: TmclStage, done: Callable[[StageStatus], bool]) -> StageStatus:
-    end = time.monotonic() + 12
+    end = time.monotonic() + 60
     while time.monotonic() < end:
         status = stage.pump()
         if done(status):

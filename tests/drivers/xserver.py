@@ -38,7 +38,7 @@ def xvfb(width: int, height: int) -> Iterator[str]:
         yield f":{number}"
     finally:
         server.terminate()
-        server.wait(10)
+        server.wait(60)
 
 
 def screenshot(display: str) -> NDArray[np.uint8]:

@@ -117,7 +117,7 @@ class FakeRig:
         result: queue.SimpleQueue[T] = queue.SimpleQueue()
         self._orders.put(lambda: result.put(what()))
         self._theirs.send(b"")
-        return result.get(timeout=10)
+        return result.get(timeout=60)
 
     def publish(
         self, body: m.AnyEvent, arrays: Arrays | None = None, *, lose: bool = False

@@ -232,7 +232,7 @@ def test_a_restart_during_a_request_repeats_it(connect: Connect) -> None:
         fake = first.enter_context(FakeRig())
 
         def restart() -> None:
-            assert heard.wait(10)
+            assert heard.wait(60)
             first.close()
             second.enter_context(FakeRig(command=fake.endpoint))
 

@@ -90,25 +90,38 @@ def test_light_a_period_late_is_seen_even_under_coarse_patterns(daemon: Daemon) 
     assert "not in step with the triggers" in daemon.log()
 
 
+ROLLING_US = 12_000.0
+
+
+def rolling(daemon: Daemon, ms: int, told: str) -> None:
+    daemon.configure(
+        camera=f"{DEEP}rolling_ms = {ms}\nrolling_told = {told}\nframe_rate_hz = 60",
+        more=PATIENCE,
+        scale=1,
+    )
+
+
 def test_a_rolling_shutter(daemon: Daemon) -> None:
-    exposure = 12_000.0
-    for told in ("true", "false"):
-        daemon.configure(
-            camera=f"{DEEP}rolling_ms = 10\nrolling_told = {told}\nframe_rate_hz = 60",
-            more=PATIENCE,
-            scale=1,
-        )
-        with daemon.start() as rig:
-            if told == "true":
-                for mode in MODES:
-                    good(rig.scan(umbra.Checkerboard(mode=mode, exposure_us=exposure)))
-            else:
-                scan = umbra.Checkerboard(mode="hardware", exposure_us=exposure)
-                info = rig.scan(scan).wait(60, check=False)
-                assert info.state is RunState.FAILED  # never a wrong result
-                assert info.missing == 27
-                assert "torn" in daemon.log()
-        daemon.stop()
+    rolling(daemon, 10, "true")
+    with daemon.start() as rig:
+        for mode in MODES:
+            good(rig.scan(umbra.Checkerboard(mode=mode, exposure_us=ROLLING_US)))
+
+
+@pytest.mark.parametrize("ms", [10, 80])
+def test_a_rolling_shutter_that_nobody_spoke_of(daemon: Daemon, ms: int) -> None:
+    rolling(daemon, ms, "false")
+    with daemon.start() as rig:
+        run = rig.scan(umbra.Checkerboard(mode="hardware", exposure_us=ROLLING_US))
+        if ms == 10:
+            good(run)  # at half the pace nothing is torn
+        else:
+            info = run.wait(60, check=False)
+            assert info.state is RunState.FAILED  # never a wrong result
+            assert info.missing == 27
+            assert info.end is not None
+            assert "no frame could be had of" in info.end.reason
+        assert "torn" in daemon.log()
 
 
 def test_a_wire_that_is_not_there_fails_the_run(daemon: Daemon) -> None:
