@@ -3,18 +3,17 @@
     prepare -> (replay what an interruption left) -> steps -> products -> end
 
 What comes before the first frame is in `daemon.preparation`, the steps are the sequencer's and the
-recorder's; here it is decided what an end means:
-a failure keeps what was recorded, an abort leaves the devices safe, a full disk only pauses.
+recorder's, what others are told meanwhile is in `daemon.standing`; here it is decided what an end
+means: a failure keeps what was recorded, an abort leaves the devices safe, a full disk only pauses.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 import structlog
@@ -24,6 +23,7 @@ from daemon.config import RigConfig
 from daemon.control import Control
 from daemon.devicethread import Revoked, Session
 from daemon.durable import StorageError
+from daemon.ending import close, end_of, of_lost, utc_now, with_exposure
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.exposer import Behind
 from daemon.exposing.modes import Choice, Mode, choose
@@ -36,32 +36,23 @@ from daemon.ring import Ring
 from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet, Result
 from daemon.sequencer import Sequencer, exposer_for
+from daemon.standing import Standing
 from daemon.store import RunFolder, Store
 from daemon.viewfinder import Viewfinder
 from drivers.base import CameraInfo, DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Progress, RunState, Waiting
+from protocol.messages import End, Progress, RunState
 from protocol.scans import OccluderScan, PatternScan
 
-_PROGRESS_S = 0.1
 _ROOM_S = 1.0
-_RATE_FRAMES = 20
 _RESULT_S = 30.0
 TRUTH_S = 60.0
-_CONCLUDE_S = 600.0
 SUN_DEG_PER_HOUR = 15.0
 _SEQUENCE_BYTES = 256 << 20
 """Memory for the frames of hardware-timed sequences, where `ring_frames` are fewer."""
-_STILL_S = 60.0
-"""A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
 
 log = structlog.get_logger(__name__)
-
-
-def utc_now() -> str:
-    """This moment, as run.json has it."""
-    return datetime.now(UTC).isoformat(timespec="microseconds")
 
 
 class Course:
@@ -84,48 +75,16 @@ class Course:
         self._store = store
         self._config = config
         self._viewfinder = viewfinder
-        self._on_change = on_change
-        self._on_progress = on_progress
+        self.standing = Standing(folder, rig.clock, on_change=on_change, on_progress=on_progress)
         self._recorder: Recorder | None = None
-        self._method: Method[Any] | None = None
-        self._phase = "preparing"
-        self._moments: deque[tuple[int, int]] = deque(maxlen=_RATE_FRAMES + 1)
-        self._told = 0.0
         self._room_seen = 0.0
         self._timings: dict[str, float] = {}
-        self._exposure_s = 0.0
         self._exposed: Counter[str] = Counter()  # see `Choice.facts`
         self._reason = ""  # why the steps ended
         self._broke_off = ""  # when an interrupted run took its last frame
-        self._waits: Waiting | None = None
         self._for_room = False  # the pause is for lack of room on the disk
-        self.beat = time.monotonic()
 
     # ------------------------------------------------------------ for others
-
-    def progress(self) -> Progress:
-        """How far it is, now."""
-        recorder, method = self._recorder, self._method
-        tally = recorder.tally if recorder else Tally()
-        summary = dict(recorder.summary) if recorder else {}
-        planned = method.planned() if method else None
-        fraction = summary.get("coverage") if planned is None else tally.taken / max(planned, 1)
-        rate = self._rate()
-        left = None if planned is None or not rate else max(0, planned - tally.taken) / rate
-        return Progress(
-            run=self.folder.id,
-            state=self.folder.file.state,
-            recorded=tally.recorded,
-            planned=planned,
-            missing=tally.missing,
-            rejected=tally.rejected,
-            fraction=fraction,
-            rate_hz=rate,
-            remaining_s=left,
-            phase=self._phase,
-            summary=summary,
-            waits=self._waits,
-        )
 
     def result(self) -> Result:
         """The result from the frames so far. Raises UmbraError(no_result)."""
@@ -136,21 +95,6 @@ class Course:
             return recorder.result(_RESULT_S)
         except NotYet as error:
             raise UmbraError(Code.NO_RESULT, str(error)) from error
-
-    @property
-    def alive(self) -> bool:
-        """Whether it has moved lately. In a pause there is nothing to move."""
-        state = self.folder.file.state
-        limit = _CONCLUDE_S if state is RunState.FINISHING else _STILL_S + 2 * self._exposure_s
-        if state is RunState.WAITING:
-            limit += self.folder.file.spec.ready.look_s
-        return state is RunState.PAUSED or time.monotonic() - self.beat < limit
-
-    def _rate(self) -> float:
-        moments = list(self._moments)
-        if len(moments) < 2 or moments[-1][0] == moments[0][0]:
-            return 0.0
-        return (moments[-1][1] - moments[0][1]) / (moments[-1][0] - moments[0][0]) * NS
 
     # ------------------------------------------------------------ the thread
 
@@ -165,9 +109,9 @@ class Course:
             config=self._config,
             control=self.control,
             viewfinder=self._viewfinder,
-            on_wait=self._wait,
-            on_look=self._look,
-            beat=self._alive,
+            on_wait=self.standing.waiting,
+            on_look=self.standing.looking,
+            beat=self.standing.live,
         )
         try:
             session = self._rig.take(f"run {self.folder.id}")
@@ -193,7 +137,8 @@ class Course:
                 self._rig.safe_within(futures, SAFE_S)
                 preparation.restore()
                 self._rig.leave(session)
-        self._close(end)
+        close(self.folder, end, self._timings)
+        self.standing.changed()
         return end
 
     def _execute(self, session: Session, preparation: Preparation) -> End:
@@ -202,20 +147,21 @@ class Course:
         resuming = bool(file.started)
         self._broke_off = self._last_frame() if resuming else ""
         prepared = preparation.prepare(session, resuming=resuming)
-        method = self._method = prepared.method
+        method = prepared.method
         bench, exposure = prepared.bench, prepared.exposure
         info = bench.camera
-        self._exposure_s = prepared.settings.get("exposure_us", 0.0) * 1e-6
-        choice = self._choose(bench, resuming)
+        exposure_us = float(prepared.settings.get("exposure_us", 0.0))
+        choice = self._choose(bench, exposure_us, resuming)
+        longest = 1.0
         if isinstance(file.spec, PatternScan) and file.spec.bracket is not None:
-            self._exposure_s *= max(file.spec.bracket)  # how long it may show no sign of life
-        self._waits = None
+            longest = max(file.spec.bracket)
+        self.standing.begins(method, exposure_us * longest * 1e-6)
         rig = {**self._rig.snapshot(), "settings": prepared.settings}
         if exposure is not None:
             rig["exposure"] = exposure.facts()
         elif resuming and (chosen := file.rig.get("exposure")):
             rig["exposure"] = chosen
-        self._update(
+        self.standing.update(
             state=RunState.RUNNING,
             started=file.started or utc_now(),
             ended="",
@@ -231,10 +177,12 @@ class Course:
         frames = self._frames(info, resuming)
         try:
             ring = self._ring(choice, bench, method.planned())
-            recorder = self._recorder = Recorder(method, frames, ring, self._taken, self._disk_full)
+            recorder = self._recorder = self.standing.recorder = Recorder(
+                method, frames, ring, self._taken, self._disk_full
+            )
             step, sub = self._replay(session, recorder, resuming)
             recorder.start()
-            self._say("scanning")
+            self.standing.say("scanning")
             self._timings["prepare_s"] = time.monotonic() - began
             scanning = self._rig.clock.now_ns()
             try:
@@ -300,12 +248,12 @@ class Course:
 
     # ------------------------------------------------------------ before
 
-    def _choose(self, bench: Bench, resuming: bool) -> Choice:
+    def _choose(self, bench: Bench, exposure_us: float, resuming: bool) -> Choice:
         """How exposures are kept in step with patterns. Raises Unsuitable."""
         file = self.folder.file
         if resuming and file.sequencing is not None:
             self._exposed.update(file.sequencing["counts"])
-        choice = choose(file.spec, self._config.sequencer, bench, self._exposure_s * 1e6)
+        choice = choose(file.spec, self._config.sequencer, bench, exposure_us)
         log.info("mode", mode=choice.mode, why=choice.why)
         for warning in choice.warnings:
             log.warning("exposure", problem=warning)
@@ -322,33 +270,6 @@ class Course:
             count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
         return Ring(count, info.shape, info.pixel_format.dtype)
 
-    def _alive(self) -> None:
-        self.beat = time.monotonic()
-
-    def _wait(self, waits: Waiting) -> None:
-        """The run waits for something before its first frame: said at each look."""
-        self.beat = time.monotonic()
-        self._waits = waits
-        if self.folder.file.state is not RunState.WAITING:
-            self._note(RunState.WAITING)
-        self._say(f"waiting for {waits.what}: {waits.seen}")
-
-    def _look(self, exposure_s: float) -> None:
-        """A picture is taken before the first frame: a sign of life, and how long the next may take
-        to come."""
-        self.beat, self._exposure_s = time.monotonic(), exposure_s
-
-    def _note(self, state: RunState) -> None:
-        """Another state, which a full disk must not keep the run from: it is written later
-        (`Runner.tend`)."""
-        try:
-            self._update(state=state)
-        except StorageError as error:
-            if error.code is not Code.STORAGE_FULL:
-                raise
-            self.folder.remember(state=state)
-            self._on_change()
-
     def _frames(self, info: CameraInfo, resuming: bool) -> FrameStore:
         if resuming and (self.folder.path / "frames.jsonl").exists():
             return FrameStore.open(self.folder.path)
@@ -361,13 +282,13 @@ class Course:
 
     def _replayed(self, session: Session) -> None:
         """A frame of before has been taken in: a sign of life, and the place to be aborted."""
-        self.beat = time.monotonic()
+        self.standing.live()
         self.control.check(session)
 
     def _replay(self, session: Session, recorder: Recorder, resuming: bool) -> tuple[int, int]:
         if not resuming:
             return 0, 0
-        self._say("taking in what was recorded before the interruption")
+        self.standing.say("taking in what was recorded before the interruption")
         self._same_sun()
         step, sub = recorder.replay(lambda: self._replayed(session))
         log.info("resumed", step=step, sub=sub, recorded=recorder.tally.recorded)
@@ -402,13 +323,13 @@ class Course:
 
     def _may_go_on(self) -> None:
         """Called at each step: a sign of life, and a pause before the disk is full."""
-        self.beat = time.monotonic()
+        self.standing.live()
         if self.folder.file.state is RunState.PAUSED and not self.control.paused:
-            self._update(state=RunState.RUNNING)  # it was resumed while it was being paused
-            self._say("scanning")
-        if self.beat - self._room_seen < _ROOM_S:
+            self.standing.goes_on()  # it was resumed while it was being paused
+        now = time.monotonic()
+        if now - self._room_seen < _ROOM_S:
             return
-        self._room_seen = self.beat
+        self._room_seen = now
         if not self.control.paused and not self._store.room_for(0):
             self._for_room = True
             self.control.pause(
@@ -420,8 +341,8 @@ class Course:
         """The sequencer has stopped at a checkpoint; comes back when it may go on."""
         if self.folder.file.state is not RunState.PAUSED:
             log.info("paused", reason=reason)
-        self._say(f"paused: {reason}" if reason else "paused")
-        self._note(RunState.PAUSED)
+        self.standing.say(f"paused: {reason}" if reason else "paused")
+        self.standing.note(state=RunState.PAUSED)
 
     def _disk_full(self, error: StorageError) -> None:
         """The disk took no more, reserve or not (recorder's thread): a pause, in which the frame
@@ -445,34 +366,18 @@ class Course:
             )
         self._for_room = False
         if self.folder.file.state is RunState.PAUSED:
-            self._moments.clear()
-            self._update(state=RunState.RUNNING)
-            self._say("scanning")
+            self.standing.goes_on()
         self.control.resume()
 
     def _taken(self, tally: Tally, summary: Mapping[str, float], exposed: Exposed) -> None:
         """The estimator has taken a frame in (separator's thread)."""
         del summary
-        now = time.monotonic()
-        self.beat = now
-        self._moments.append((self._rig.clock.now_ns(), tally.taken))
         if exposed.frame is not None:
             self._viewfinder.offer(exposed.frame, self._rig.camera.device.info(), self.folder.id)
-        if now - self._told >= _PROGRESS_S or tally.taken == self.folder.file.planned:
-            self._told = now
-            self._on_progress(self.progress())
-
-    def _say(self, phase: str) -> None:
-        self._phase = phase
-        self._on_progress(self.progress())
-
-    def _update(self, **changes: Any) -> None:
-        self.beat = time.monotonic()
-        self.folder.update(**changes)
-        self._on_change()
+        self.standing.taken(tally)
 
     def _count(self, tally: Tally, choice: Choice) -> None:
-        self.folder.update(
+        self.standing.note(
             recorded=tally.recorded,
             missing=tally.missing,
             rejected=tally.rejected,
@@ -482,16 +387,15 @@ class Course:
     # ------------------------------------------------------------ after
 
     def _conclude(self, recorder: Recorder, info: CameraInfo, truth: Mapping[str, Any]) -> End:
-        self.beat = time.monotonic()
-        self._update(state=RunState.FINISHING)
-        self._say("writing products")
+        self.standing.update(state=RunState.FINISHING)
+        self.standing.say("writing products")
         began = time.monotonic()
         lost = recorder.lost_patterns
         try:
             result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
         except NotYet:
             if lost:
-                raise UmbraError(Code.FRAMES_MISSING, f"{_of_lost(lost)}: scan again") from None
+                raise UmbraError(Code.FRAMES_MISSING, f"{of_lost(lost)}: scan again") from None
             raise
         self._timings["separate_s"] = time.monotonic() - began
         made = products.write(
@@ -501,54 +405,8 @@ class Course:
             pixel_format=info.pixel_format,
             frame=self._viewfinder.picture(),
             truth=truth,
-            timings={**self._timings, "rate_hz": self._rate()},
+            timings={**self._timings, "rate_hz": self.standing.rate()},
         )
         self.folder.add_products(made)
         self._timings["products_s"] = time.monotonic() - began
         return end_of(lost, self._reason)
-
-    def _close(self, end: End) -> None:
-        close(self.folder, end, self._timings)
-        self._on_change()
-
-
-def with_exposure(result: Result, rig: Mapping[str, Any]) -> Result:
-    """The result's facts with the exposure that was chosen for it (run.json's `rig`), and its
-    problem as advice."""
-    chosen = rig.get("exposure")
-    if not chosen:
-        return result
-    facts = {**result.facts, "exposure": chosen}
-    if problem := chosen.get("problem"):
-        facts["advice"] = [f"Auto-exposure: {problem}.", *facts.get("advice", ())]
-    return replace(result, facts=facts)
-
-
-def end_of(lost: Mapping[int, str], reason: str) -> End:
-    """The end of a run whose products are made; `lost` are patterns that it has no frame of, and
-    why."""
-    if not lost:
-        return End(state=RunState.DONE, reason=reason)
-    return End(
-        state=RunState.FAILED,
-        code=Code.FRAMES_MISSING,
-        reason=f"{_of_lost(lost)}; the products are made without them",
-    )
-
-
-def _of_lost(lost: Mapping[int, str]) -> str:
-    some = ", ".join(str(n) for n in list(lost)[:8]) + (" ..." if len(lost) > 8 else "")
-    why = list(lost.values())[-1]
-    return f"no frame could be had of {len(lost)} of the patterns ({some}): {why}"
-
-
-def close(folder: RunFolder, end: End, timings: Mapping[str, float]) -> None:
-    """Write a run's end; never raises. A disk that is full learns of it later (`Runner.tend`)."""
-    written = {"state": end.state, "end": end, "ended": utc_now(), "timings": dict(timings)}
-    try:
-        folder.update(**written)
-    except (OSError, UmbraError):
-        log.exception("the run's end could not be written yet")
-        folder.remember(**written)
-    say = log.info if end.state is RunState.DONE else log.warning
-    say("run " + end.state, reason=end.reason, code=end.code, by=end.by)

@@ -36,6 +36,12 @@ def require_meterable(spec: Spec, bench: Bench) -> None:
         return
     if bench.camera.recorded:
         raise Unsuitable("a recording's light and exposure are as they were taken", where)
+    if not {"software", "none"} & set(bench.camera.triggers):
+        raise Unsuitable(
+            "the camera is triggered by the projector's sequences only, so no picture can be taken "
+            "before the scan: set the exposure by hand (`umbra camera`), or leave the look away",
+            where,
+        )
     if isinstance(spec, CalibrateDark):
         raise Unsuitable("in the dark there is no light to look at", where)
 

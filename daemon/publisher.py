@@ -9,7 +9,7 @@ import structlog
 import zmq
 from numpy.typing import NDArray
 
-from daemon.course import utc_now
+from daemon.ending import utc_now
 from protocol import wire
 from protocol.messages import AnyEvent, Event
 

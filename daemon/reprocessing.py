@@ -23,8 +23,8 @@ import structlog
 
 from daemon import products
 from daemon.control import Control
-from daemon.course import close, end_of, utc_now, with_exposure
 from daemon.durable import storage
+from daemon.ending import close, end_of, utc_now, with_exposure
 from daemon.failures import as_error
 from daemon.frames import ARRAY, LINES, FrameRecord, FrameStore
 from daemon.preparation import as_exposed

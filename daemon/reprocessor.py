@@ -18,7 +18,7 @@ import structlog
 from daemon import aftermath
 from daemon.calibration import Calibrations
 from daemon.config import RigConfig
-from daemon.course import utc_now
+from daemon.ending import utc_now
 from daemon.failures import as_error
 from daemon.reprocessing import Reprocessing, method_of, source_of
 from daemon.scans.method import Unsuitable

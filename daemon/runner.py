@@ -14,7 +14,8 @@ import structlog
 
 from daemon import aftermath
 from daemon.config import RigConfig
-from daemon.course import Course, utc_now
+from daemon.course import Course
+from daemon.ending import utc_now
 from daemon.exposing.modes import choose
 from daemon.failures import as_error
 from daemon.frames import count
@@ -246,7 +247,7 @@ class Runner:
     @property
     def alive(self) -> bool:
         """Whether the run under way, if any, has moved lately (the watchdog's question)."""
-        return self._active is None or self._active.alive
+        return self._active is None or self._active.standing.alive
 
     @property
     def current(self) -> RunFolder | None:
@@ -267,7 +268,7 @@ class Runner:
     @property
     def progress(self) -> Progress | None:
         """How far the run under way is."""
-        return self._active.progress() if self._active else None
+        return self._active.standing.progress() if self._active else None
 
     def queue(self) -> list[RunFolder]:
         """The runs that wait, the next first."""

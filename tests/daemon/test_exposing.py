@@ -20,12 +20,12 @@ from daemon.devicethread import Revoked, Session
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.modes import Choice, Mode
 from daemon.exposing.video import Video
-from daemon.lightmeter import LightMeter
+from daemon.lightmeter import LightMeter, require_meterable
 from daemon.recorder import Exposed, Recorder
 from daemon.rig import Rig
 from daemon.ring import Ring
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Circle, Method, Watch
+from daemon.scans.method import Circle, Method, Unsuitable, Watch
 from daemon.scans.pattern_scan import response_of
 from daemon.sequencer import Sequencer, exposer_for
 from drivers.base import CameraSettings
@@ -259,6 +259,22 @@ def test_each_look_at_the_light_is_a_sign_of_life(stand: Stand) -> None:
     assert len(said) == chosen.looks
     assert said[-1] == pytest.approx(chosen.exposure_us * 1e-6)
     assert stand.dark()
+
+
+@pytest.mark.parametrize(
+    "stand",
+    [{"camera": 'triggers = ["hardware"]'}, {"camera": 'triggers = ["none"]'}],
+    indirect=True,
+)
+def test_a_camera_that_only_sequences_trigger_takes_no_looks(stand: Stand) -> None:
+    bench = stand.rig.bench()
+    require_meterable(TwoImage(), bench)
+    if bench.camera.triggers == ("none",):
+        require_meterable(TwoImage(auto_exposure=True), bench)
+        return
+    with pytest.raises(Unsuitable, match="set the exposure by hand") as caught:
+        require_meterable(TwoImage(auto_exposure=True), bench)
+    assert caught.value.where == "$.auto_exposure"
 
 
 class Watched:

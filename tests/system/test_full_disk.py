@@ -81,6 +81,8 @@ def test_a_run_that_waits_for_room_can_be_aborted(daemon: Daemon, tiny: Path) ->
         rig.abort(run.id)
         info = run.wait(60, check=False)
         assert info.state is RunState.ABORTED
+        kept = len(FrameStore.open(tiny / "runs" / run.id, readonly=True))
+        assert (info.recorded, info.missing) == (kept, 0)
         (tiny / "ballast").unlink()
         until(lambda: "aborted" in (tiny / "runs" / run.id / "run.json").read_text())
         assert rig.scan(umbra.TwoImage()).wait(60).state is RunState.DONE
