@@ -12,10 +12,10 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-def pytest_configure() -> None:
-    """Hear Ctrl-C: what a shell starts in the background ignores it, and so do its children."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+def pytest_runtest_setup() -> None:
+    """Hear Ctrl-C: what a shell starts in the background ignores it, and so do its children; and a
+    GenTL library that a test before has loaded puts a handler of its own below Python's."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
