@@ -149,7 +149,7 @@ def fit(
     """
     share = np.ones(gaps.shape[:2]) if used is None else used.astype(np.float64)
     # misfits are relative to it, for each group to have its say
-    size = np.einsum("gek,ge->g", gaps**2, share)
+    size = np.maximum(np.einsum("gek,ge->g", gaps**2, share), 1e-9)  # 0: there is no noise at all
     log = np.log(RATIOS)
     away = np.log(_AMOUNTS)
     loud = min(float(np.median(noise)) / _LOUD, 1.0)
