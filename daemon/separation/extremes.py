@@ -140,8 +140,9 @@ class MaxMin:
             dark, deviation = explained.deviations(low, high)
             ends = estimate(explained.model, low, high, dark, deviation, k=1)
             direct_var, global_var = ends.variances(b, g, explained.uneven)
-            reference = self._reference_share() / (g * explained.uneven) ** 2
-            global_var += np.square(dark) * np.float32(reference)
+            reference = self._references.ambient_variance(told)
+            if reference is not None:
+                global_var += reference * np.float32(g**-2)
             planes = {"direct_std": np.sqrt(direct_var), "global_std": np.sqrt(global_var)}
             found = {"blur_px": explained.blur, **explained.systematic(ends, deviation, b, g, k=1)}
             if self._unbiased:
@@ -190,13 +191,6 @@ class MaxMin:
             return None
         low, high = (self._light(ranks) for ranks in self._followed.ranks())
         return self._order.explain(low, high, self._noise, self._response, self._average_of)
-
-    def _reference_share(self) -> float:
-        """The variance of ambient light over that of a pattern's averaged frames."""
-        for kind in (Lighting.AMBIENT, Lighting.BLACK):
-            if frames := self._references.frames(kind):
-                return self._average_of / frames
-        return 0.0
 
     def _light(self, samples: NDArray[Any]) -> Plane:
         return self._response.linear(samples) if self._mean is None else samples

@@ -83,7 +83,7 @@ class OrderStatistics:
         found, sigma = self._fitted(groups, own)
         if not own.measured:  # light that differs from pattern to pattern is in ranks, not in it
             pictured = own.deviation(groups.light.astype(np.float32))
-            whole = groups.light > _CLIPPED * sigma
+            whole = groups.light - float(_ends(response)[1]) > _CLIPPED * sigma
             sigma = np.where(whole, np.minimum(sigma, pictured), sigma)
         ranks = None if own.measured else _by_level(response, groups.light, sigma * average**0.5)
         told = noise.told(ranks)
@@ -138,8 +138,7 @@ def _grouped(low: Plane, high: Plane, response: Response) -> _Groups | None:
     light = np.stack([[np.median(end[g]) for end in (high[1], low[1])] for g in groups])
     middle = np.asarray(light.mean(axis=1), dtype=np.float32)
     # light at an end of the scale has its noise cut off there, and says nothing of it
-    ends = response.linear_between(np.array([response.saturated_from, 0.0], dtype=np.float32))
-    used = np.abs(light - ends) > _WITHIN * gaps[:, :, -1] * steps[:, None]
+    used = np.abs(light - _ends(response)) > _WITHIN * gaps[:, :, -1] * steps[:, None]
     if not used.any():
         used[:] = True
     there = used.any(axis=1)
@@ -152,8 +151,14 @@ def _grouped(low: Plane, high: Plane, response: Response) -> _Groups | None:
     )
 
 
+def _ends(response: Response) -> Plane:
+    """The linear light of saturation and of 0 counts."""
+    return response.linear_between(np.array([response.saturated_from, 0.0], dtype=np.float32))
+
+
 _LOG = np.log(RATIOS)
-_CLIPPED = 4.0  # deviations above black from which a picture has all of its noise
+_FIRST = 1.6  # deviations that the first of a dozen samples is off
+_CLIPPED = 4.0  # deviations above 0 counts from which a picture has all of its noise
 _SHOT = (0.0, 0.3, 0.6, 0.9, 1.0)  # shares of shot noise in the variance at the typical light
 
 
@@ -179,9 +184,18 @@ class Explained:
     uneven: float = 1.0
 
     def deviations(self, low: Plane, high: Plane) -> tuple[Plane, Plane]:
-        """What the unlit and the lit samples differ by, from ranks (keep, ...)."""
+        """What the unlit and the lit samples differ by, from ranks (keep, ...).
+
+        The darkest sample is darker than unlit light by noise, and so are its shot noise and the
+        brightest's: the level that counts is that of the last kept rank, or of one by as much off.
+        """
         by = np.float32(self.uneven)
-        return self.told.deviation(low[0]) * by, self.told.deviation(high[0]) * by
+        if len(low) >= KEEP:
+            return self.told.deviation(low[-1]) * by, self.told.deviation(high[-1]) * by
+        off = np.float32(_FIRST * by)
+        unlit = low[0] + off * self.told.deviation(low[0])
+        lit = high[0] - off * self.told.deviation(high[0])
+        return self.told.deviation(unlit) * by, self.told.deviation(lit) * by
 
     def systematic(
         self, ends: Ends, deviation: Plane, b: float, g: float, k: int | None = None

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ _LOUD = 0.04  # noise over the step below which blur shows, and a picture matter
 _DOUBT = 0.5  # a bias that is corrected still costs this part of it: blur differs over a scene
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OrderErrors:
     """Errors of estimates from the k brightest and darkest, for one blur; step = 1.
 
@@ -72,6 +73,15 @@ class OrderErrors:
     def steps(self, k: int) -> NDArray[np.float64]:
         """Mean of the k brightest less the k darkest (ratios)."""
         return 1.0 + self.lit[:, k - 1] - self.unlit[:, k - 1]
+
+    @cached_property
+    def fine(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """`gaps` at the noise of _FINE, and the logarithms of that noise over the raw step."""
+        log = np.log(RATIOS)
+        table = np.stack(
+            [np.interp(_FINE, log, column) for column in self.gaps.reshape(log.size, -1).T], axis=1
+        ).reshape(_FINE.size, *self.gaps.shape[1:])
+        return table, _FINE - np.log(np.interp(_FINE, log, self.step))
 
     @property
     def k(self) -> NDArray[np.int64]:
@@ -150,7 +160,6 @@ def fit(
     share = np.ones(gaps.shape[:2]) if used is None else used.astype(np.float64)
     # misfits are relative to it, for each group to have its say
     size = np.maximum(np.einsum("gek,ge->g", gaps**2, share), 1e-9)  # 0: there is no noise at all
-    log = np.log(RATIOS)
     away = np.log(_AMOUNTS)
     loud = min(float(np.median(noise)) / _LOUD, 1.0)
     texture = _BELOW * loud / (1.0 + np.square(_TEXTURE / away))
@@ -161,12 +170,9 @@ def fit(
     costs = np.empty(len(models))
     found: list[tuple[NDArray[np.float64], int, float]] = []
     for index, model in enumerate(models):
-        table = np.stack(
-            [np.interp(_FINE, log, column) for column in model.gaps.reshape(log.size, -1).T], axis=1
-        ).reshape(_FINE.size, *gaps.shape[1:])
+        table, raw = model.fine
         misfit = ((gaps[:, None] - table[None]) ** 2).sum(axis=3)
         misfit *= (share / size[:, None])[:, None]
-        raw = _FINE - np.log(np.interp(_FINE, log, model.step))
         place = np.interp(wanted, raw, np.arange(raw.size))
         cost = misfit[group, np.rint(place).astype(np.intp), end].sum(axis=3)
         cost += prior[:, None] * share.sum(axis=1)  # (kinds, amounts, groups)

@@ -135,10 +135,15 @@ class References:
         """Samples that were saturated in a white frame."""
         return self._white_saturated
 
-    def share(self, source: str) -> float:
-        """The variance of `ambient` for one frame's, to first order in the leakage."""
-        kind = Lighting.AMBIENT if source == "ambient frame" else Lighting.BLACK
-        return 1.0 / max(self.frames(kind), 1)
+    def ambient_variance(self, told: Told) -> Plane | None:
+        """The variance of `ambient`, to first order in the leakage; `told` as in `whole_variance`.
+        None where nothing tells of ambient light."""
+        for kind in (Lighting.AMBIENT, Lighting.BLACK):
+            mean = self.mean(kind)
+            if mean is not None:
+                share = told.average / self.frames(kind)
+                return np.square(told.deviation(mean)) * np.float32(share)
+        return None
 
     def facts(self, ambient_from: str) -> dict[str, Any]:
         """Which reference frames there were and what ambient light was taken from."""

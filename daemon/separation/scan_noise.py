@@ -22,6 +22,29 @@ _ENOUGH = 100  # samples that make a level's deviation
 _LEVELS = 24
 
 
+def _pictured(response: Response, pixels: NDArray[Any]) -> Noise:
+    return from_frame(pixels, response.full_scale, response.bayer)
+
+
+class ReferenceNoise:
+    """Upper bounds of noise by the first reference of each kind: it has no pattern in it."""
+
+    def __init__(self, response: Response) -> None:
+        self._response = response
+        self._found: dict[Lighting, Noise] = {}
+
+    def add(self, pixels: NDArray[Any], lighting: Lighting) -> None:
+        """Take in a reference frame."""
+        if lighting not in self._found:
+            self._found[lighting] = _pictured(self._response, pixels)
+
+    def of(self, pattern: Noise) -> Noise:
+        """The bound that a pattern's picture gives, and these."""
+        for found in self._found.values():
+            pattern = pattern.bounded_by(found)
+        return pattern
+
+
 class ScanNoise:
     """What a scan's frames tell of the camera's noise; constant memory."""
 
@@ -29,16 +52,14 @@ class ScanNoise:
         self._response = response
         self._average = average
         self._repeats = TemporalNoise(response.full_scale)
-        self._picture: Noise | None = None
-        self._pictured = False
-        self._kinds: set[Lighting] = set()
+        self._pattern: Noise | None = None
+        self._bounds = ReferenceNoise(response)
         self._last: tuple[int, NDArray[Any]] | None = None
 
     def add(self, pixels: NDArray[Any], pattern: int) -> None:
         """Take in a frame of a pattern."""
-        if not self._pictured:
-            self._pictured = True
-            self._bound(pixels)
+        if self._pattern is None:
+            self._pattern = _pictured(self._response, pixels)
         if self._average == 1:
             return
         sample = np.ascontiguousarray(pixels[::_SAMPLE, ::_SAMPLE])
@@ -47,14 +68,12 @@ class ScanNoise:
         self._last = pattern, sample
 
     def add_reference(self, pixels: NDArray[Any], lighting: Lighting) -> None:
-        """Take in a reference frame, whose picture has no pattern in it: the first of its kind."""
-        if lighting not in self._kinds:
-            self._kinds.add(lighting)
-            self._bound(pixels)
+        """Take in a reference frame."""
+        self._bounds.add(pixels, lighting)
 
-    def _bound(self, pixels: NDArray[Any]) -> None:
-        found = from_frame(pixels, self._response.full_scale, self._response.bayer)
-        self._picture = found if self._picture is None else self._picture.bounded_by(found)
+    @property
+    def _picture(self) -> Noise | None:
+        return None if self._pattern is None else self._bounds.of(self._pattern)
 
     def own(self) -> Told:
         """What the scan's frames alone say."""
@@ -173,21 +192,28 @@ class ResidualNoise:
         self._response = response
         self._frequencies: dict[int, _Residuals] = {}
         self._picture: Noise | None = None
+        self._bounds = ReferenceNoise(response)
 
     def add(self, pixels: NDArray[Any], light: Plane, frequency: int, delta: float) -> None:
         """Take in a frame (counts and their linear light) of a phase."""
         if self._picture is None:
-            self._picture = from_frame(pixels, self._response.full_scale, self._response.bayer)
+            self._picture = _pictured(self._response, pixels)
         residuals = self._frequencies.setdefault(frequency, _Residuals())
         residuals.add(light[::_SAMPLE, ::_SAMPLE], delta)
+
+    def add_reference(self, pixels: NDArray[Any], lighting: Lighting) -> None:
+        """Take in a reference frame."""
+        self._bounds.add(pixels, lighting)
 
     def told(self) -> Told:
         """What is known by now of one frame's noise: see `ScanNoise`."""
         fitted = self._fitted()
         if fitted is not None:
             return told(self._response, fitted, RESIDUALS, [fitted], sure=True)
-        bounds = [] if self._picture is None else [self._picture]
-        return told(self._response, self._picture, PICTURE, bounds)
+        if self._picture is None:
+            return told(self._response, None, PICTURE, [])
+        shown = self._bounds.of(self._picture)
+        return told(self._response, shown, PICTURE, [shown])
 
     @property
     def misfit(self) -> float | None:

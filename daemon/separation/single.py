@@ -16,7 +16,7 @@ from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.noise import Noise, from_frame
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
-from daemon.separation.scan_noise import PICTURE, Told, told
+from daemon.separation.scan_noise import PICTURE, ReferenceNoise, Told, told
 from daemon.separation.steadiness import leaks
 
 _ASTRAY = 1.5  # times the change across stripes: along them there is no more
@@ -25,6 +25,7 @@ _HALF = 0.1  # lit fractions so near to a half have their middle at ½(W + K)
 _PEAK = 0.82 * 0.9
 """Deviation of a row's peaks in a square over a pixel's: a peak is the larger of two pixels as
 bright, and light interpolated between peaks is the mean of more than one."""
+_LONE = 0.625**0.5  # the same of a mosaic, whose colours have one sample a stripe: 1½ and ½ of 2
 
 
 class PeaksAndValleys:
@@ -60,6 +61,7 @@ class PeaksAndValleys:
         self._reduce = reduce
         self._across = across
         self._references = References(response)
+        self._bounds = ReferenceNoise(response)
         self._mean = FrameMean(response)
         self._open: int | None = None
         self._picture: Plane | None = None
@@ -77,6 +79,7 @@ class PeaksAndValleys:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
+            self._bounds.add(pixels, observation.lighting)
             return
         else:
             if self._open is not None and self._open != observation.pattern:
@@ -113,7 +116,7 @@ class PeaksAndValleys:
         saturated = self._reduced(self._saturated.astype(np.float32)) > 0
         noise = self._noise(picture)
         deviation = noise.deviation(brightest)
-        planes = self._stated(deviation, noise.deviation(darkest))
+        planes = self._stated(noise, deviation, noise.deviation(darkest))
         mirrored = self._mirrored(picture, noise)
         looked, advice = self._looked(picture, brightest, darkest)
         plain = replace(self._response, bayer="")
@@ -193,21 +196,28 @@ class PeaksAndValleys:
         found = astray(wave, strong, self._across)
         return None if found is None else block_mean(found.astype(np.float32), self._reduce) > 0.5
 
-    def _stated(self, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
+    def _stated(self, told: Told, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
         """Deviations of the components from those of one pixel's peaks and valleys.
 
         A peak is the largest of a few pixels as bright; it speaks for its row up to the next peak,
         so that a square of k x k averages k rows of about one peak each.
         """
-        rows = max(self._reduce // 2 if self._response.bayer else self._reduce, 1)
-        share = np.float32(_PEAK / np.sqrt(rows * max(self._frames, 1)))
+        bayer = self._response.bayer
+        rows = max(self._reduce // 2 if bayer else self._reduce, 1)
+        sites = np.asarray((1.0, 2.0, 1.0) if bayer else 1.0, dtype=np.float32)  # of two green ones
+        share = np.float32(_LONE if bayer else _PEAK) / np.sqrt(
+            sites * np.float32(rows * max(self._frames, 1))
+        )
         b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
-        reference = 0.0
-        for kind in (Lighting.AMBIENT, Lighting.BLACK):
-            if not reference and self._references.frames(kind):
-                reference = (1.0 - b) ** 2 / (self._references.frames(kind) * rows**2)
         high, low = most * share, least * share
-        of_dark = np.square(low) + np.square(least) * np.float32(reference)
+        of_dark = np.square(low)
+        for kind in (Lighting.AMBIENT, Lighting.BLACK):
+            reference = self._references.mean(kind)
+            if reference is not None:
+                averaged = sites * np.float32(self._references.frames(kind) * rows**2)
+                noise = told.deviation(self._reduced(reference))
+                of_dark += np.square(noise) * (np.float32((1.0 - b) ** 2) / averaged)
+                break
         of_lit = np.square(high) * np.float32(b * b)
         return {
             "direct_std": np.hypot(high, low) * np.float32(1.0 / (1.0 - b)),
@@ -219,6 +229,7 @@ class PeaksAndValleys:
         counts = self._response.counts(picture)
         mean = from_frame(counts, self._response.full_scale, self._response.bayer)
         shown = Noise(mean.levels, tuple(d * self._frames**0.5 for d in mean.deviations))
+        shown = self._bounds.of(shown)
         return told(self._response, shown, PICTURE, [shown])
 
     def _extremes(self, picture: Plane) -> tuple[Plane, Plane]:

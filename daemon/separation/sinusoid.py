@@ -90,6 +90,7 @@ class LeastSquares:
             return
         if observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
+            self._noise.add_reference(pixels, observation.lighting)
             return
         frequency, delta = self._phases[observation.pattern]
         light = self._response.linear(pixels)

@@ -75,6 +75,7 @@ class TopK:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
+            self._noise.add_reference(pixels, observation.lighting)
             return
         elif self._mean is None:
             if self._low.frames == 0:
@@ -127,16 +128,18 @@ class TopK:
             lit, unlit = lit - ambient, unlit - ambient
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, b)
         direct_var, global_var = ends.variances(b, g, uneven)
-        if ambient is not None:
-            reference = self._references.share(source) * self._average / (g * uneven) ** 2
-            global_var += np.square(unlit_deviation) * np.float32(reference)
+        reference = self._references.ambient_variance(told)
+        if reference is not None:
+            global_var += reference * np.float32(g**-2)
         whole, clipped = self._references.whole(b), self._references.white_saturated
         if whole is not None and clipped is not None:
-            # W - K holds half as much noise of the references as the darkest samples less K
+            # W - K holds half as much noise of the references as the darkest samples less K; but
+            # where bright light has more noise than dark, these have less
             source = whole.source
             alone = direct_var + self._references.whole_variance(told, b)
-            np.copyto(indirect, whole.light - direct, where=~clipped)
-            np.copyto(global_var, alone, where=~clipped)
+            better = ~clipped & (alone < global_var)
+            np.copyto(indirect, whole.light - direct, where=better)
+            np.copyto(global_var, alone, where=better)
         planes: dict[str, NDArray[Any]] = {
             "direct_std": np.sqrt(direct_var),
             "global_std": np.sqrt(global_var),
