@@ -226,7 +226,7 @@ def _theory() -> Ratio:
     scatter = float(np.sqrt(runs.var(axis=0, ddof=1).mean())) / FULL
     return Ratio(
         name="accuracy, sinusoid's scatter, N = 7",
-        value=scatter / (2 * sigma * np.sqrt(2 / count) / (1 - LEAKAGE)),
+        value=scatter / (2 * sigma * float(np.sqrt(2 / count)) / (1 - LEAKAGE)),
         of="scatter of direct over the theory's",
         at_most=1.1,
         facts={"scatter": scatter},
