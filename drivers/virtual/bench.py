@@ -177,6 +177,9 @@ class Bench:
     def main_sources(self) -> tuple[str, ...]:
         """The projector, or without one the lights that an occluder shades, or all."""
         first = [name for name, source in self.sources.items() if source.main]
-        if not first and self.carrier is not None and self.carrier.shades in self.sources:
-            first = [self.carrier.shades]
-        return tuple(first or self.sources)
+        return tuple(first) or self.shaded(tuple(self.sources))
+
+    def shaded(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Of some sources those that the occluder stands under; all, if it stands under none."""
+        shades = "" if self.carrier is None else self.carrier.shades
+        return (shades,) if shades in names else names
