@@ -43,7 +43,7 @@ from drivers.base import CameraInfo, DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
 from protocol.messages import End, Progress, RunState
-from protocol.scans import OccluderScan, PatternScan
+from protocol.scans import AnyScan, OccluderScan, PatternScan
 
 _ROOM_S = 1.0
 _RESULT_S = 30.0
@@ -198,7 +198,7 @@ class Course:
                 finally:
                     self._count(recorder.tally, choice)
             self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
-            truth = self._truth(session)
+            truth = self._truth(session, _sources(file.spec, bench))
             self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
             return self._conclude(recorder, info, truth)
         finally:
@@ -238,10 +238,10 @@ class Course:
         finally:
             self._exposed.update(apparatus.counts)
 
-    def _truth(self, session: Session) -> dict[str, Any]:
+    def _truth(self, session: Session, sources: tuple[str, ...]) -> dict[str, Any]:
         """What a simulated camera knows; a scan does not fail for the lack of it."""
         try:
-            return self._rig.camera.call(lambda c: c.truth(), TRUTH_S, session)
+            return self._rig.camera.call(lambda c: c.truth(sources), TRUTH_S, session)
         except DeviceError as error:
             log.warning("no truth to compare with", problem=str(error))
             return {}
@@ -410,3 +410,10 @@ class Course:
         self.folder.add_products(made)
         self._timings["products_s"] = time.monotonic() - began
         return end_of(lost, self._reason)
+
+
+def _sources(spec: AnyScan, bench: Bench) -> tuple[str, ...]:
+    """The lights that a scan separates; (): the projector's."""
+    if not isinstance(spec, OccluderScan):
+        return ()
+    return bench.lights if spec.lights is None else spec.lights

@@ -186,6 +186,8 @@ def compare(
         "unit": "fraction of full scale",
         "over": "pixels with no quality bit; *_all: all pixels; NaN left out",
     }
+    if times := components.facts.get("ambient_in_global"):
+        found["global_holds"] = f"{times:.3g} times the ambient light, which the truth has none of"
     for name, plane in (("direct", components.direct), ("global", components.global_)):
         true = truth[name]
         if true.shape[0] > plane.shape[0]:  # a method of lower resolution

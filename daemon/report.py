@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -22,11 +23,12 @@ from daemon.quality import BITS, Bit
 from daemon.separation.finish import ADVICE
 from daemon.store import RunFile
 from protocol.messages import Product
-from protocol.scans import AnyScan, PatternScan
+from protocol.scans import AnyScan, OccluderScan, PatternScan
 
 _ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a line of advice
 _DIM_BELOW = 0.25  # of full scale: a scene that uses less than this is under-exposed
 _MOST_BARS = 240
+_MANY_LOST = 0.1  # of a video's frames
 _FOOTER = (
     "Pictures are for eyes: sRGB, all at one scale, clipped. The measurements are in the TIFF "
     "files: linear, float32, NaN where nothing was measured."
@@ -108,7 +110,14 @@ def advice(subject: Subject) -> list[str]:
             "resume the run, or scan again."
         )
     if file.missing:
-        lines.append(f"{_frames(file.missing)} missing: see below why, then scan again.")
+        total = file.recorded + file.missing
+        slower = isinstance(file.spec, OccluderScan) and file.missing > _MANY_LOST * total
+        lines.append(
+            f"{file.missing} of {total} frames were lost, and what they would have covered with "
+            "them: scan again at a lower --frame-rate-hz, or on a machine with less to do."
+            if slower
+            else f"{_frames(file.missing)} missing: see below why, then scan again."
+        )
     if file.rejected:
         lines.append(f"{_frames(file.rejected)} recorded but not used: see below why.")
     lines += facts.get("advice", [])  # the estimator's own
@@ -168,7 +177,8 @@ def _figures(subject: Subject) -> str:
     if truth:
         for name in ("direct", "global"):
             error = _percent(truth[f"rmse_{name}"])
-            found.append((f"of full scale: RMS error of {name}", error, ""))
+            also = " with ambient light" if name == "global" and "global_holds" in truth else ""
+            found.append((f"of full scale: RMS error of {name}{also}", error, ""))
     return "".join(
         f'<div class="{kind}"><b>{escape(value)}</b><span>{escape(name)}</span></div>'
         for name, value, kind in found
@@ -364,19 +374,41 @@ def timed(file: RunFile, timings: Mapping[str, float]) -> Iterable[tuple[str, st
 def missing(records: Records) -> str:
     """Frames that are missing or were not used, and why."""
     reasons: dict[tuple[str, str], list[int]] = {}
+    strengths: dict[str, list[int]] = {}  # of the source, per cent, by what was said of it
     for r in records:
         if r.missing:
             reasons.setdefault(("Missing", r.missing), []).append(r.index)
         elif not r.observation.used:
-            reasons.setdefault(("Not used", r.observation.reason), []).append(r.index)
+            why, strength = _without_strength(r.observation.reason)
+            reasons.setdefault(("Not used", why), []).append(r.index)
+            if strength is not None:
+                strengths.setdefault(why, []).append(strength)
     if not reasons:
         return ""
     rows = "".join(
-        f"<li><b>{kind}: {escape(why or 'no reason given')}</b><em>{_frames(len(where))}</em>"
+        f"<li><b>{kind}: {escape(_with_range(why, strengths) or 'no reason given')}</b>"
+        f"<em>{_frames(len(where))}</em>"
         f'<p class="do">{escape(_ranges(where))}</p></li>'
         for (kind, why), where in reasons.items()
     )
     return f'<section><h2>Missing and rejected</h2><ul class="missing">{rows}</ul></section>'
+
+
+_STRENGTH = re.compile(r"source at (\d+)%: (.+)", re.DOTALL)
+
+
+def _without_strength(reason: str) -> tuple[str, int | None]:
+    """A reason, and the source's strength that it began with; None: it has none."""
+    said = _STRENGTH.fullmatch(reason)
+    return (said[2], int(said[1])) if said else (reason, None)
+
+
+def _with_range(why: str, strengths: Mapping[str, list[int]]) -> str:
+    """A reason with the range of the source's strengths that were grouped under it."""
+    if why not in strengths:
+        return why
+    least, most = min(strengths[why]), max(strengths[why])
+    return f"source at {least}{'' if least == most else f' to {most}'}%: {why}"
 
 
 def files(products: Sequence[Product]) -> str:

@@ -303,9 +303,11 @@ class Camera(Device):
     def stop(self) -> None:
         """End acquisition; idempotent."""
 
-    def truth(self) -> dict[str, NDArray[np.float32]]:
-        """A simulated camera's noiseless `direct` and `global` (RGB or mono, linear counts, ambient
-        and black removed) under its present settings; {} for every camera of this world."""
+    def truth(self, sources: tuple[str, ...] = ()) -> dict[str, NDArray[np.float32]]:
+        """A simulated camera's noiseless `direct` and `global` (RGB or mono, linear counts,
+        ambient and black removed) under its present settings, of the projector or of the lights
+        that are named; {} for every camera of this world."""
+        del sources
         return {}
 
 

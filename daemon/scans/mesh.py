@@ -99,7 +99,8 @@ class MeshMethod(OccluderMethod[Mesh]):
         assert bench.stage is not None
         penumbra = geometry.penumbra_mm(spec.scene_mm or 0.0, source_deg=spec.source_deg)
         rate = spec.frame_rate_hz or min(bench.camera.max_rate_hz or _RATE_HZ, _RATE_HZ)
-        exposure = spec.exposure_us * 1e-6 if spec.exposure_us else min(_EXPOSURE_S, 1.0 / rate)
+        exposure_us = spec.exposure_us or bench.exposure_us
+        exposure = exposure_us * 1e-6 if exposure_us else min(_EXPOSURE_S, 1.0 / rate)
         try:
             best = geometry.plan(
                 mesh,

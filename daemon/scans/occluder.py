@@ -50,7 +50,11 @@ VAIN_TURNS = 5
 GROWTH = 0.0005
 """Coverage grows by as much, or noise moves it."""
 
+MANY_LOST = 0.1
+"""A part of the frames, lost, that is to be told with the coverage that they would have brought."""
+
 INCOMPLETE = "incomplete frame"
+LOST = "lost frame"
 CLOUD = "cloud"
 SHAKEN = "moved too far, or too blurred, to be aligned"
 PLACED = "before the camera's place was known"
@@ -92,6 +96,7 @@ class OccluderMethod(Method[O]):
         self._place = "" if spec.align else "not looked for"
         self._aligned = 0  # frames of the present collection
         self._rejected: Counter[str] = Counter()
+        self._came = 0  # frames, with those that were lost
         self._used = 0  # frames of the occluder in the present collection
         self._brighter = 0  # frames in a row
         self._in_vain = _InVain()
@@ -144,15 +149,18 @@ class OccluderMethod(Method[O]):
         """See `Method`. Under the sun a small change of its strength is scaled; a frame under a
         cloud is kept but not used, for sun and sky do not vary together."""
         lighting = step.lighting if isinstance(step, Expose) else Lighting.PATTERN
+        self._came += 1
         if taken.incomplete or taken.pixels is None:
-            self._rejected[INCOMPLETE] += 1
-            return Observation(lighting=lighting, used=False, reason=INCOMPLETE)
+            why = LOST if taken.pixels is None else INCOMPLETE
+            self._rejected[why] += 1
+            return Observation(lighting=lighting, used=False, reason=why)
         if lighting is not Lighting.PATTERN:
             return Observation(lighting=lighting)
         return self._decide(taken.pixels)
 
     def recall(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Method`: what was decided before is decided again, to be followed on."""
+        self._came += 1
         if observation.reason == INCOMPLETE:
             self._rejected[INCOMPLETE] += 1
         elif observation.lighting is Lighting.PATTERN:
@@ -268,6 +276,13 @@ class OccluderMethod(Method[O]):
             )
         turns = self._in_vain.turns(summary, seconds, self._watch.motion)
         if turns >= VAIN_TURNS:
+            lost = self._rejected[LOST]
+            if lost > MANY_LOST * self._came:
+                return (
+                    f"{covered:.1%} of the lit pixels are covered, {wanted} wanted: {VAIN_TURNS} "
+                    f"turns covered no more, but {lost} of {self._came} frames were lost; scan "
+                    "again at a lower --frame-rate-hz"
+                )
             return (
                 f"{covered:.1%} of the lit pixels are covered, {wanted} wanted: {VAIN_TURNS} turns "
                 "covered no more; what is left this circle does not reach, or it lies in shadows "

@@ -11,7 +11,7 @@ and stay as they are; ones that are smaller are flagged with the islands.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import cv2
@@ -22,7 +22,7 @@ from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.noise import Noise, TemporalNoise
-from daemon.separation.plateau import WHOLE, Part, Plateaus
+from daemon.separation.plateau import BAND, WHOLE, Part, Plateaus
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
 from daemon.separation.registration import placed
@@ -40,6 +40,7 @@ _SAMPLE = 4  # noise is measured on every fourth row and column
 _FOLLOWED = 40_000  # pixels on which coverage is followed
 _EVERY = 4  # frames from one look at coverage to the next
 _STILL = 0.2  # part of the picture that the mesh's shadow leaves as it was from frame to frame
+_PULLED = 0.03  # of direct: noise that pulls by more is worth a line of advice
 _FINEST, _COARSEST = 5.0, 201.0  # pitches in pixels that are believed
 
 
@@ -141,8 +142,10 @@ class MeshOccluder:
         else:
             other = np.zeros_like(brightest) if ambient is None else ambient
             direct, indirect = light_model.from_extremes(brightest - other, darkest - other, beta)
+        known = ambient is not None or whole is not None
+        pull = self._pull(noise, brightest, darkest, other) if self._averaged else {}
         pitch = self._pitch(beta)
-        covered = self._covered(levels, one, pitch)
+        covered = self._coverage(levels, one, pitch)
         judged = Judgement.of_extremes(one, frames)
         if self._averaged:
             # Of a pixel that nothing happens to, noise alone parts the ends by 2 deviations.
@@ -170,6 +173,9 @@ class MeshOccluder:
                 "leakage": 0.0,
                 "coverage": round(covered.share, 5),
                 "pitch_px": round(pitch, 2),
+                **({} if known else {"ambient_in_global": round(1.0 / beta, 3)}),
+                **({"noise_pulls_at_most": pull} if pull else {}),
+                "advice": _advice(None if known else beta, pull),
                 **self._references.facts(_source(ambient, whole)),
             },
         )
@@ -186,6 +192,26 @@ class MeshOccluder:
             return _Levels(linear(brightest), linear(darkest), on_high, on_low, lit, unlit)
         between = self._response.linear_between
         return _Levels(between(high), between(low), on_high, on_low, lit, unlit)
+
+    def _pull(
+        self, noise: Noise | None, bright: Plane, dark: Plane, other: Plane
+    ) -> dict[str, float]:
+        """How far, at most, what is taken for noise pulls the levels together: medians of what it
+        takes of direct and adds to global, each as a part of it. In a place that is in full light,
+        or in the umbra, only for a moment a mean over a band is off by half of it. {}: nothing
+        tells."""
+        if noise is None:
+            return {}
+        ends = (self._plateaus.high.extreme, self._plateaus.low.extreme)
+        high, low = (np.float32(BAND / 2) * self._response.deviation(noise, x) for x in ends)
+        span, rest = bright - dark, dark - other
+        tells = (span > 2 * high) & (rest > low)
+        if not tells.any():
+            return {}
+        return {
+            "direct": round(float(np.median((high + low)[tells] / span[tells])), 4),
+            "global": round(float(np.median(low[tells] / rest[tells])), 4),
+        }
 
     def _hole_fraction(self, ambient: Plane | None, whole: Plane | None) -> float:
         """β: as told, else the mean of all frames over the open one, ambient removed from both.
@@ -205,6 +231,21 @@ class MeshOccluder:
         return float(np.clip(measured, 1e-3, 0.999))
 
     # ------------------------------------------------------------ coverage
+
+    def _coverage(self, levels: _Levels, one: Plane, pitch: float) -> _Coverage:
+        """`_covered` of a whole picture: of a mosaic by colours, for the neighbours to be alike."""
+        if not self._response.bayer:
+            return self._covered(levels, one, pitch)
+        never_lit, never_unlit, single = (np.zeros(one.shape, np.bool_) for _ in range(3))
+        frames = np.zeros(one.shape, np.uint16)
+        count = lit = 0
+        for row, column in np.ndindex(2, 2):
+            part = np.s_[row::2, column::2]
+            found = self._covered(levels.of(part), one[part], max(pitch / 2, 3.0))
+            never_lit[part], never_unlit[part] = found.never_lit, found.never_unlit
+            single[part], frames[part] = found.single, found.frames
+            count, lit = count + found.covered, lit + found.lit
+        return _Coverage(never_lit, never_unlit, single, frames, count, lit)
 
     def _covered(self, levels: _Levels, one: Plane, pitch: float) -> _Coverage:
         """Which pixels (H, W) were in full light and in the umbra, as far as those around tell."""
@@ -251,7 +292,8 @@ class MeshOccluder:
             short & ~too_dark,
             single,
             frames,
-            covered / max(wanted, 1),
+            covered,
+            wanted,
         )
 
     def _grey(self, light: Plane) -> Plane:
@@ -310,17 +352,27 @@ class _Levels:
     lit: NDArray[np.uint16]
     unlit: NDArray[np.uint16]
 
+    def of(self, part: Part) -> _Levels:
+        """Of a part of the picture."""
+        return _Levels(*(getattr(self, field.name)[part] for field in fields(self)))
+
 
 @dataclass(frozen=True, slots=True)
 class _Coverage:
-    """Masks (H, W), the frames that a pixel's components rest on, and the share of the pixels that
-    are lit at all which rest on LEAST_FRAMES or more."""
+    """Masks (H, W), the frames that a pixel's components rest on, the pixels that are lit at all,
+    and those of them which rest on LEAST_FRAMES or more."""
 
     never_lit: NDArray[np.bool_]
     never_unlit: NDArray[np.bool_]
     single: NDArray[np.bool_]
     frames: NDArray[np.uint16]
-    share: float
+    covered: int
+    lit: int
+
+    @property
+    def share(self) -> float:
+        """Part of the lit pixels that is covered."""
+        return self.covered / max(self.lit, 1)
 
 
 def _closed(plane: NDArray[Any], kernel: NDArray[np.uint8]) -> tuple[Plane, Plane]:
@@ -350,3 +402,21 @@ def _source(ambient: Plane | None, whole: Plane | None) -> str:
     if ambient is not None:
         return "ambient frame"
     return "none" if whole is None else "open frame"
+
+
+def _advice(beta: float | None, pull: dict[str, float]) -> list[str]:
+    """What to know of the components: `beta` where ambient light is not known, what noise does."""
+    lines = []
+    if beta is not None:
+        lines.append(
+            f"Global holds {1.0 / beta:.2g} times the light that is not the source's: an ambient "
+            "frame (--references ambient, of a lamp) or an open one (of recordings) takes it out"
+        )
+    if pull.get("direct", 0.0) > _PULLED:
+        lines.append(
+            "Noise, and motion that looks like it, may make direct up to "
+            f"{pull['direct']:.0%} too small and global up to {pull['global']:.0%} too large "
+            "(medians), where a place is in full light or in the umbra only for a moment: expose "
+            "longer, move more slowly (--feed-mm-s), or take a coarser mesh or one that is nearer"
+        )
+    return lines

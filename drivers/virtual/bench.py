@@ -44,6 +44,11 @@ class Source(Protocol):
         """Where it stands, and how its emission image spreads from there."""
         ...
 
+    @property
+    def strength(self) -> float:
+        """Of its full light, 1 being a projector's; clouds are not in it."""
+        ...
+
     def emitted(self, start_ns: int, end_ns: int) -> Sequence[Emission]:
         """What it emitted in an interval that is over. Raises Forgotten."""
         ...
@@ -154,13 +159,14 @@ class Bench:
         direct = [np.zeros((size[1], size[0]), np.float32) for _ in layouts]
         others = [np.zeros((size[1], size[0]), np.float32) for _ in layouts]
         for name in names:
-            pinhole = self.sources[name].pinhole
+            source = self.sources[name]
+            pinhole, strength = source.pinhole, np.float32(source.strength)
             operator = transport(*size, pinhole)
             lit = operator.light(np.ones((pinhole.height, pinhole.width), np.float32))
             for k, layout in enumerate(layouts):
                 parts = operator.render(lit, layout)
-                direct[k] += parts[0]
-                others[k] += parts[1]
+                direct[k] += strength * parts[0]
+                others[k] += strength * parts[1]
         return direct, others
 
     def prepare(self, width: int, height: int) -> None:
@@ -169,6 +175,11 @@ class Bench:
             transport(width, height, self.sources[name].pinhole)
 
     def main_sources(self) -> tuple[str, ...]:
-        """The projector, or without one all lights."""
+        """The projector, or without one the lights that an occluder shades, or all."""
         first = [name for name, source in self.sources.items() if source.main]
-        return tuple(first or self.sources)
+        return tuple(first) or self.shaded(tuple(self.sources))
+
+    def shaded(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Of some sources those that the occluder stands under; all, if it stands under none."""
+        shades = "" if self.carrier is None else self.carrier.shades
+        return (shades,) if shades in names else names

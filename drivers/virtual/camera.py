@@ -483,8 +483,8 @@ class VirtualCamera(VirtualDevice, Camera):
         return True
 
     def truth(self, sources: tuple[str, ...] = ()) -> dict[str, NDArray[np.float32]]:
-        """See Camera; of the projector, or of the named sources of the bench."""
-        names = sources or self.bench.main_sources()
+        """See Camera."""
+        names = self.bench.shaded(sources) or self.bench.main_sources()
         if not names:
             return {}
         direct, others = self.bench.components(names, self._size, ("R", "G", "B"))

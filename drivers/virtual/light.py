@@ -50,7 +50,7 @@ class LightOptions(VirtualOptions, frozen=True, kw_only=True, forbid_unknown_fie
     size_mm: Annotated[float, Meta(ge=0)] = 2.0  # diameter of a lamp: makes the penumbra
     on: bool = False  # from the beginning; a sun always is
     drift_deg_per_hour: float = 15.0  # of a sun
-    clouds: tuple[tuple[float, float], ...] = ()  # (second, strength) by linear interpolation
+    clouds: tuple[tuple[float, float], ...] = ()  # (second, part of strength), interpolated
     cloudiness: Annotated[float, Meta(ge=0, lt=1)] = 0.0  # depth of random clouds
     cloud_seed: Annotated[int, Meta(ge=0)] = 1
 
@@ -128,6 +128,11 @@ class VirtualLight(VirtualDevice, Light):
     def pinhole(self) -> Pinhole:
         """See Source: the emission image lies in the plane of the occluder."""
         return self._pinhole
+
+    @property
+    def strength(self) -> float:
+        """See Source."""
+        return self._o.strength
 
     def emitted(self, start_ns: int, end_ns: int) -> Sequence[Emission]:
         """See Source."""

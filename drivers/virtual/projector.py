@@ -197,6 +197,11 @@ class VirtualProjector(VirtualDevice, Projector):
         """See Source."""
         return self._pinhole
 
+    @property
+    def strength(self) -> float:
+        """See Source."""
+        return 1.0
+
     def emitted(self, start_ns: int, end_ns: int) -> Sequence[Emission]:
         """See Source."""
         return [

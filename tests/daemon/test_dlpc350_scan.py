@@ -43,7 +43,7 @@ Image = NDArray[np.uint8]
 class Dmd:
     """The mirrors as a source on the bench: lit patterns, dark between and after them."""
 
-    name, main = "projector", True
+    name, main, strength = "projector", True, 1.0
     pinhole = Pinhole((230.0, 420.0, -230.0), TARGET, *TENTH, math.radians(21.0))
 
     def __init__(self, bench: Bench, clock: Clock) -> None:

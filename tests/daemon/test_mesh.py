@@ -208,6 +208,48 @@ def test_colour_mosaic_and_tone() -> None:
     assert max(errors(separate(encoded, response=gamma))) < 400.0
 
 
+def test_a_mosaics_colours_are_judged_among_their_own() -> None:
+    """A colour in which noise is large, next to one in which it is not, is no island."""
+    of_colour = np.ones((HEIGHT, WIDTH))
+    of_colour[1::2, 1::2], of_colour[::2, ::2] = 0.1, 0.4
+    rng = np.random.default_rng(5)
+    frames = []
+    for frame in circle(COVERING):
+        light = frame * of_colour
+        frames.append(counts(light + rng.normal(0, 1, light.shape) * np.sqrt(20.0 * light)))
+    estimator = MeshOccluder(
+        Response(full_scale=65535, bayer="RG"), hole_fraction=MESH.hole_fraction
+    )
+    for frame in frames:
+        estimator.update(frame, Observation())
+    found = estimator.result()
+    assert flagged(found, Quality.NEVER_LIT | Quality.NEVER_UNLIT).mean() < 0.02
+    assert found.facts["coverage"] == pytest.approx(estimator.summary()["coverage"], abs=0.02)
+
+
+def test_without_an_ambient_frame_it_says_what_global_holds() -> None:
+    frames = circle(COVERING, noise=650.0, ambient=AMBIENT)
+    found = separate(frames)
+    assert found.facts["ambient_in_global"] == pytest.approx(1 / MESH.hole_fraction, abs=0.01)
+    assert "--references ambient" in found.facts["advice"][0]
+    known = separate(frames, references={Lighting.AMBIENT: np.full((HEIGHT, WIDTH), AMBIENT)})
+    assert "ambient_in_global" not in known.facts
+    assert not any("--references ambient" in line for line in known.facts["advice"])
+
+
+def test_what_noise_takes_of_direct_is_bounded() -> None:
+    noisy = separate(circle(COVERING, noise=650.0))
+    direct, indirect = scene()
+    lit = direct > 0
+    short = 1 - np.nanmedian(noisy.direct[lit] / direct[lit])
+    more = np.nanmedian(noisy.global_[lit] / indirect[lit]) - 1
+    pull = noisy.facts["noise_pulls_at_most"]
+    assert short < pull["direct"] < 0.12
+    assert more < pull["global"] < 0.4
+    assert any("may make direct up to" in line for line in noisy.facts["advice"])
+    assert not any("may make direct" in line for line in separate(circle(COVERING)).facts["advice"])
+
+
 def test_the_same_observations_give_the_same_bits() -> None:
     frames = circle(COVERING, noise=300.0)
     one, other = (MeshOccluder(DEEP, hole_fraction=0.3) for _ in range(2))

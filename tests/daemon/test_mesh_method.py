@@ -10,7 +10,7 @@ import pytest
 
 from daemon.scans.catalog import method_for
 from daemon.scans.mesh import MeshMethod
-from daemon.scans.method import Bench, Circle, Sweep, Unsuitable, Watch
+from daemon.scans.method import Bench, Circle, Sweep, Taken, Unsuitable, Watch
 from drivers.base import CameraInfo, PixelFormat, StageInfo
 from protocol import mesh as geometry
 from protocol.patterns import Axis
@@ -84,6 +84,27 @@ def test_a_circle_that_covers_no_more_ends_after_some_turns_in_use() -> None:
     assert "97.0% of the lit pixels are covered, 99.5% wanted: 5 turns covered no more" in said
     assert seconds == pytest.approx(15 * turn_s, rel=0.6)
     assert seconds > 12 * turn_s
+
+
+def test_lost_frames_are_named_where_coverage_ends() -> None:
+    method, motion = planned(replace_spec(KNOWN, feed_mm_s=40.0))
+    step = method.step(0, {})
+    assert step is not None
+    for k in range(30):
+        seen = method.observe(step, Taken(0, k, incomplete=True))
+        assert (seen.used, seen.reason) == (False, "lost frame")
+    turn_s = math.tau * motion.radius_mm / motion.feed_mm_s
+    said = ""
+    for k in range(1000):
+        said = said or method.enough({"frames": k, "coverage": 0.97}, k * turn_s / 50)
+    assert "covered no more, but 30 of 30 frames were lost" in said
+    assert "does not reach" not in said
+
+
+def test_the_camera_as_it_is_set_bounds_the_feed() -> None:
+    quick, slow = (planned(KNOWN, replace(RIG, exposure_us=us))[1] for us in (2e3, 30e3))
+    assert slow.feed_mm_s == pytest.approx(0.05 * 6.25 / 30e-3)
+    assert quick.feed_mm_s > slow.feed_mm_s
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from daemon.frames import FrameRecord
 from daemon.separation.estimator import Observation
 from daemon.store import RunFile
 from protocol.messages import Product, RunState
-from protocol.scans import AnyScan, Checkerboard, Stick, TwoImage
+from protocol.scans import AnyScan, Checkerboard, Mesh, Stick, TwoImage
 
 EVIL = """<script>alert("1")</script>'"&$id${note}"""
 
@@ -161,6 +161,27 @@ def test_an_unfinished_run_says_so() -> None:
             )
         )[0]
     )
+
+
+def test_clouds_are_one_row_and_many_lost_frames_are_named() -> None:
+    clouds = [
+        record(k, observation=Observation(used=False, reason=f"source at {60 + k}%: cloud"))
+        for k in range(4)
+    ]
+    lost = [record(k, missing="lost between camera and host") for k in range(4, 8)]
+    sunny = subject(Mesh(hole_fraction=0.3), file={"missing": 20}, records=[*clouds, *lost])
+    text = Page(report.render(sunny)).text
+    assert "Not used: source at 60 to 63%: cloud 4 frames 0–3" in text
+    assert text.count("cloud") == 1
+    assert "20 of 45 frames were lost" in report.advice(sunny)[0]
+    assert "--frame-rate-hz" in report.advice(sunny)[0]
+
+
+def test_global_with_ambient_light_is_called_so() -> None:
+    truth = {"rmse_direct": 0.01, "rmse_global": 0.05, "global_holds": "3.26 times ..."}
+    text = Page(report.render(subject(facts=bits() | {"truth": truth}))).text
+    assert "RMS error of global with ambient light" in text
+    assert "RMS error of direct with" not in text
 
 
 def test_truth_is_a_headline() -> None:

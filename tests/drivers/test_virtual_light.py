@@ -201,6 +201,31 @@ def test_wax_is_mostly_global_and_water_glows() -> None:
     assert water.cut(truth["global"])[60:100, 20:60].mean() > 3 * wall
 
 
+def test_a_strong_lamp_has_as_strong_a_truth() -> None:
+    rig = Rig(SMALL_P, SMALL_C | {"exposure_us": 4000.0})
+    lamp = cast(VirtualLight, build("light", "virtual", "left", {"strength": 3.0}, rig.context))
+    lamp.connect()
+    off = rig.linear(None)
+    lamp.set(True)
+    on = rig.linear(None) - off
+    truth = rig.camera.truth(("left",))
+    whole = truth["direct"] + truth["global"]
+    dim = whole < 60000
+    assert np.mean(dim) > 0.9
+    np.testing.assert_allclose(on[dim], whole[dim], atol=3)
+
+
+def test_the_truth_is_that_of_the_light_under_the_occluder() -> None:
+    rig = Rig({}, SMALL_C)
+    bench = rig.camera.bench
+    del bench.sources["projector"]
+    for name in ("left", "right"):
+        build("light", "virtual", name, {}, rig.context)
+    assert bench.main_sources() == ("left", "right")
+    build("stage", "virtual", "stage", {"light": "right"}, rig.context)
+    assert bench.main_sources() == ("right",)
+
+
 def test_each_lamp_has_a_truth_of_its_own() -> None:
     rig = Rig(SMALL_P, SMALL_C)
     lamp = cast(VirtualLight, build("light", "virtual", "left", {}, rig.context))
