@@ -41,6 +41,9 @@ from daemon.viewfinder import Glimpse, Viewfinder
 from protocol.errors import UmbraError
 from protocol.messages import AnyEvent, DeviceChanged, DeviceInfo, Logged, PreviewTaken, RigState
 
+ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""What ends the daemon in an orderly way: the service manager, Ctrl-C, a terminal that closes."""
+
 _TEND_S = 1.0
 _SWITCH_S = 0.0005
 """Python's switch interval: commands must not wait 5 ms for a thread that computes."""
@@ -193,7 +196,9 @@ class _Daemon:
             raise StartError(f"{self._reason}; the log has the details")
 
     def _heed_signals(self, loop: asyncio.AbstractEventLoop) -> None:
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in ENDING:
+            if number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue  # nohup: it outlives its terminal
             loop.add_signal_handler(number, self._signalled, number.name)
 
     def _publish_log(
@@ -250,7 +255,7 @@ class _Daemon:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        for number in (signal.SIGTERM, signal.SIGINT):  # one more is no reason to die of it
+        for number in ENDING:  # one more is no reason to die of it
             asyncio.get_running_loop().remove_signal_handler(number)
             signal.signal(number, signal.SIG_IGN)
 
@@ -349,6 +354,7 @@ class _Daemon:
 
     def _signalled(self, name: str) -> None:
         """The first signal stops, the next one hurries."""
+        log.info("signal", signal=name)  # who sent it, asyncio does not tell
         if self._stop.is_set():
             self._hurry.set()
         self._ask_to_stop(name)

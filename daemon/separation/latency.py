@@ -83,8 +83,9 @@ class Latency:
             spread = float(told.std(ddof=1)) if told.size > 1 else float("nan")
             how = f"{told.size} frames that saw the change"
         elif parts.min() >= 1 - _PARTLY:
-            # It changed before the first frame: to wait for as long as that one did is enough.
-            mean, spread = max(0.0, float(delays.min())), 0.0
+            # It changed before the first frame: to wait for as long as that one did is enough. A
+            # bound, and no measurement: the delay itself and its spread stay unknown.
+            mean, spread = max(0.0, float(delays.min())), float("nan")
             how = (
                 "no frame saw the change: it came before the first exposure, "
                 f"{mean / 1e3:.3g} ms after the driver's moment"
@@ -98,14 +99,25 @@ class Latency:
         if wait < _RESOLUTION_US and mean < _RESOLUTION_US:
             wait = 0.0
         advice = []
-        if 0 < told.size < _LEAST:
+        if not told.size:
+            advice.append(
+                "No exposure saw the light change: the latency is not measured, only bounded by "
+                f"the first exposure, {mean / 1e3:.3f} ms after the driver's moment. Later scans "
+                + (
+                    f"wait for that bound ({wait / 1e3:.3f} ms), which is safe."
+                    if wait
+                    else "need not wait for so short a time."
+                )
+            )
+        elif told.size < _LEAST:
             advice.append(
                 f"Only {told.size} frames saw the change: more flashes (--flashes), or a longer "
                 "exposure (--exposure), tell the spread better."
             )
         facts = {
             "values": {"latency_s": round(wait / 1e6, 9)},
-            "latency_ms": round(mean / 1e3, 4),
+            "latency_ms": round(mean / 1e3, 4) if told.size else None,
+            "at_most_ms": None if told.size else round(mean / 1e3, 4),
             "spread_ms": None if np.isnan(spread) else round(spread / 1e3, 4),
             "least_ms": round(float(told.min()) / 1e3, 4) if told.size else None,
             "greatest_ms": round(float(told.max()) / 1e3, 4) if told.size else None,
@@ -113,7 +125,10 @@ class Latency:
             "from": how,
             "flashes": len(self._seen),
             "figures": [
-                ["later than the driver says", f"{mean / 1e3:.3f} ms"],
+                [
+                    "later than the driver says",
+                    f"{'' if told.size else 'at most '}{mean / 1e3:.3f} ms",
+                ],
                 ["spread", "unknown" if np.isnan(spread) else f"{spread / 1e3:.3f} ms"],
                 ["waited before each exposure", f"{wait / 1e3:.3f} ms"],
             ],

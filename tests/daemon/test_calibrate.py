@@ -196,6 +196,28 @@ def test_a_projector_that_is_on_time_is_not_waited_for() -> None:
     assert "before the first exposure" in facts["from"]
 
 
+def test_a_change_before_the_first_exposure_is_a_bound_and_no_measurement() -> None:
+    estimator = Latency(RESPONSE, 50_000.0)
+    estimator.update(shot(SCENE * 0.05), Observation(lighting=Lighting.BLACK))
+    estimator.update(shot(SCENE), Observation(lighting=Lighting.WHITE))
+    for n, delay in enumerate((900.0, 534.0, 20_000.0)):
+        seen = Observation(pattern=2 * n + 1, delay_us=delay, exposure_us=8000.0)
+        estimator.update(shot(SCENE), seen)
+    facts = estimator.result().facts
+    unknown = ("latency_ms", "spread_ms", "least_ms", "greatest_ms")
+    assert [facts[name] for name in unknown] == [None] * 4
+    assert facts["at_most_ms"] == facts["wait_ms"] == 0.534
+    assert facts["values"] == {"latency_s": 0.000534}  # safe: it had come by then
+    figures = dict(facts["figures"])
+    assert figures["later than the driver says"] == "at most 0.534 ms"
+    assert figures["spread"] == "unknown"
+    (line,) = facts["advice"]
+    assert "not measured" in line
+    assert "Later scans wait for that bound (0.534 ms)" in line
+    measured = flashes(21_300.0).result().facts
+    assert measured["at_most_ms"] is None
+
+
 def test_a_flash_that_never_comes_is_said() -> None:
     with pytest.raises(NotYet, match="--longest-ms"):
         flashes(1e9).result()

@@ -37,6 +37,17 @@ def test_a_second_signal_hurries(daemon: Daemon) -> None:
         assert rig.run(run.id).refresh().state is RunState.DONE
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_the_log_says_which_signal_ended_it(daemon: Daemon, number: signal.Signals) -> None:
+    with daemon.start():
+        assert daemon.process is not None
+        daemon.process.send_signal(number)
+        assert daemon.process.wait(60) == 0  # a terminal that closes stops it in order, too
+    assert f'"signal": "{number.name}"' in daemon.log()
+    assert f'"reason": "{number.name}"' in daemon.log()
+    assert '"stopped"' in daemon.log().splitlines()[-1]
+
+
 def test_a_run_that_was_hurried_can_be_resumed(daemon: Daemon) -> None:
     with daemon.start() as rig:
         run = rig.scan(LONG).id
