@@ -30,6 +30,7 @@ from daemon.separation.order import Ranked
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
 from daemon.separation.registration import placed
+from daemon.separation.sweeping import Sweeping
 
 CELL = 8
 """Side of a cell, in pixels: its mean has an eighth of a pixel's noise."""
@@ -69,6 +70,7 @@ class Occluder:
         self._cell_high: Plane | None = None
         self._pixel_noise = TemporalNoise(self._response.full_scale)
         self._cell_noise = TemporalNoise(self._response.full_scale)
+        self._sweeping = Sweeping()
         self._last: tuple[NDArray[Any], Plane] | None = None
         self._moved = False  # the last frame was interpolated
 
@@ -90,6 +92,7 @@ class Occluder:
             pixels = self._response.scaled(pixels, 1.0 / observation.strength)
             self._low.add(pixels)
             self._high.add(pixels)
+            self._sweeping.add(pixels)
             self._watch(pixels, moved)
 
     def _watch(self, pixels: NDArray[Any], moved: bool) -> None:
@@ -127,6 +130,7 @@ class Occluder:
         if ambient is not None:
             brightest, darkest = brightest - ambient, darkest - ambient
         direct, indirect = light_model.from_extremes(brightest, darkest, self._alpha)
+        swept, advice = self._sweeping.told()
         return finish(
             direct,
             indirect,
@@ -142,6 +146,8 @@ class Occluder:
                 "unused_frames": self._unused,
                 "lit_fraction": self._alpha,
                 "leakage": 0.0,
+                **swept,
+                "advice": advice,
                 **self._references.facts("ambient frame" if ambient is not None else "none"),
             },
         )

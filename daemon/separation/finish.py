@@ -50,6 +50,12 @@ ADVICE: dict[Quality, tuple[float, str]] = {
 }
 """What to do where more than a part of the pixels has a bit: the part, and words."""
 
+UNUSABLE = 0.5
+"""Of the pixels that are lit at all, the part without components beyond which it is said."""
+
+_LIT = 0.05
+"""Of the light of the brightest hundredth: a pixel with less is not lit at all."""
+
 _BINS = 64
 
 
@@ -107,7 +113,11 @@ def finish(
     counted = count(quality)
     figures = {
         **facts,
-        "advice": [*facts.get("advice", ()), *_advice(counted)],
+        "advice": [
+            *facts.get("advice", ()),
+            *_advice(counted),
+            *_unusable(quality, counted, brightest),
+        ],
         "noise_counts": round(float(np.nanmedian(judgement.deviation)), 4),
         "black_level": response.black,
         "tone": response.tone,
@@ -171,6 +181,26 @@ def _advice(counted: dict[str, dict[str, float]]) -> list[str]:
         if part > least:
             lines.append(f"{part:.1%} {words}")
     return lines
+
+
+def _unusable(
+    quality: NDArray[np.uint16], counted: dict[str, dict[str, float]], brightest: Plane
+) -> list[str]:
+    """A line where most of the pixels that are lit at all came to nothing, and no other says so."""
+    if counted["low_modulation"]["fraction"] > ADVICE[Quality.LOW_MODULATION][0]:
+        return []
+    nothing = Quality.DARK | Quality.LOW_MODULATION | Quality.NEVER_LIT | Quality.NEVER_UNLIT
+    # By light and not by DARK: where noise is taken for more than it is, all is dark.
+    lit = _some(brightest > np.float32(_LIT) * np.quantile(brightest, 0.99))
+    lost = int(np.count_nonzero(lit & (quality & np.uint16(nothing) != 0)))
+    part = lost / max(int(np.count_nonzero(lit)), 1)
+    if part <= UNUSABLE:
+        return []
+    return [
+        f"{part:.1%} of the pixels that are lit at all cannot be separated (low modulation, dark, "
+        "never lit or never unlit): see that the frames are this method's, in order, and that "
+        "patterns or shadow reach all that the camera sees"
+    ]
 
 
 def histogram(light: Plane, full_scale: float) -> dict[str, Any]:

@@ -162,3 +162,31 @@ def test_the_summary_knows_how_far_the_sweep_is() -> None:
     assert covered[0] == 0.0
     assert 0.3 < covered[len(covered) // 2] < 0.7
     assert covered[-1] > 0.9
+
+
+def test_frames_of_shifted_checkerboards_are_not_a_sticks_and_it_says_so() -> None:
+    direct, indirect = scene()
+    rows, columns = np.indices(direct.shape)
+    frames = []
+    for shift in np.ndindex(5, 5):
+        lit = ((rows + 3 * shift[0]) // 8 + (columns + 3 * shift[1]) // 8) % 2
+        frames.append(np.rint(lit * direct + indirect).astype(np.uint16))
+    found = separate(frames)
+    assert [line for line in found.facts["advice"] if "do not look like a stick's" in line]
+    assert found.facts["change_per_frame"] > 0.25
+    assert found.facts["lit_of_the_time"] == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize(("noise", "stick", "stride"), [(150, 8, 2), (2000, 8, 4), (150, 24, 12)])
+def test_a_sticks_frames_look_like_a_sticks(noise: float, stick: int, stride: int) -> None:
+    found = separate(sweep(range(-stick, WIDTH, stride), noise, stick))
+    assert not [line for line in found.facts["advice"] if "do not look like" in line]
+    assert found.facts["lit_of_the_time"] > 0.8
+
+
+def test_most_lit_pixels_lost_is_said() -> None:
+    half = separate(sweep(range(-10, 40, 2)))
+    lines = [line for line in half.facts["advice"] if "cannot be separated" in line]
+    assert len(lines) == 1
+    whole = separate(sweep(WHOLE))
+    assert not [line for line in whole.facts["advice"] if "cannot be separated" in line]
