@@ -70,6 +70,8 @@ class OrderStatistics:
         patterns = levels(0.0).shape[0]
         self.keep = max(min(KEEP, patterns // 2), 1)
         self._models = simulate(levels, self.keep)
+        for model in self._models:
+            model.fine  # noqa: B018 - now, and not when the last frame is in
 
     def explain(
         self, low: Plane, high: Plane, noise: ScanNoise, response: Response, average: int
