@@ -39,7 +39,12 @@ def test_a_second_signal_hurries(daemon: Daemon) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_the_log_says_which_signal_ended_it(daemon: Daemon, number: signal.Signals) -> None:
-    with daemon.start():
+    before = signal.signal(number, signal.SIG_DFL)  # under nohup a daemon ignores SIGHUP, rightly
+    try:
+        daemon.launch()
+    finally:
+        signal.signal(number, before)
+    with daemon.connect():
         assert daemon.process is not None
         daemon.process.send_signal(number)
         assert daemon.process.wait(60) == 0  # a terminal that closes stops it in order, too
