@@ -19,8 +19,7 @@ help:  ## say what there is
 demo: $(VENV)/.runtime  ## a scan on the virtual rig, with its result in demo-out
 	$(BIN)/umbra demo -o demo-out --force $(ARGS)
 
-# Twice as many workers as cores: tests of real processes wait more than they compute.
-WORKERS ?= $(shell echo $$((2 * $$(nproc 2>/dev/null || echo 2))))
+WORKERS ?= auto
 
 test: $(VENV)/.dev  ## the whole suite; ARGS="-k name" for a part of it
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
