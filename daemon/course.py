@@ -42,7 +42,7 @@ from daemon.viewfinder import Viewfinder
 from drivers.base import CameraInfo, DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Progress, RunState
+from protocol.messages.runs import End, Progress, RunState
 from protocol.scans import AnyScan, OccluderScan, PatternScan
 
 _ROOM_S = 1.0

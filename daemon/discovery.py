@@ -21,7 +21,8 @@ from daemon.config import DeviceTable
 from drivers import registry
 from drivers.base import Device, DeviceError
 from protocol.errors import Code, UmbraError
-from protocol.messages import DeviceInfo, Found, Search
+from protocol.messages.findings import Found, Search
+from protocol.messages.rig import DeviceInfo
 
 _START_S = 60.0
 _ASKED = b"\n"  # what the process says first, when the driver is about to be asked

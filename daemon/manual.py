@@ -31,7 +31,8 @@ from daemon.snapshot import snap, snap_whole
 from daemon.viewfinder import Viewfinder
 from drivers.base import Camera, CameraInfo, CameraSettings, DeviceError, Frame
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, LockInfo
+from protocol.messages.events import AnyEvent
+from protocol.messages.rig import LockInfo
 from protocol.patterns import AnyPattern, Stripes
 from protocol.scans import SingleImage
 

@@ -24,7 +24,9 @@ from drivers.base import DeviceError, Stage
 from drivers.base import StageState as DriverState
 from drivers.base import StageStatus as DriverStatus
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, StageChanged, StageState, StageStatus
+from protocol.messages.events import AnyEvent, StageChanged
+from protocol.messages.replies import StageStatus
+from protocol.messages.rig import StageState
 
 CALL_S = 5.0
 """Deadline of a call that does not wait for the motion's end."""

@@ -25,7 +25,7 @@ from daemon.metering import Level
 from drivers.base import DeviceError
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
-from protocol.messages import Waiting
+from protocol.messages.runs import Waiting
 from protocol.scans import Ready
 
 _MENDS = {

@@ -32,7 +32,7 @@ from daemon.store import RunFolder, Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
 from drivers.base import CameraSettings, DeviceError
 from protocol.errors import Code, UmbraError
-from protocol.messages import Waiting
+from protocol.messages.runs import Waiting
 from protocol.scans import AnyScan, OccluderScan, Radiometry, Scan
 
 log = structlog.get_logger(__name__)

@@ -28,7 +28,7 @@ from drivers.base import (
 )
 from drivers.clock import Clock, RealClock, ScaledClock
 from protocol.errors import Code, UmbraError
-from protocol.messages import DeviceInfo, Health
+from protocol.messages.rig import DeviceInfo, Health
 
 CONNECT_S = 20.0
 """Deadline of a connect: the slowest is a camera's SDK that enumerates."""

@@ -39,7 +39,8 @@ from protocol.connection import (
 from protocol.errors import Code, UmbraError
 from protocol.following import SILENCE_S, Following
 from protocol.keys import ClientKeys
-from protocol.messages import Progress, RunInfo, RunState, Welcome
+from protocol.messages.replies import Welcome
+from protocol.messages.runs import Progress, RunInfo, RunState
 from protocol.results import Separation
 from protocol.run import described, failure
 from protocol.scans import AnyScan

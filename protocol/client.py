@@ -39,7 +39,7 @@ from protocol.connection import (
 )
 from protocol.errors import Code, UmbraError
 from protocol.keys import ClientKeys
-from protocol.messages import Welcome
+from protocol.messages.replies import Welcome
 from protocol.run import Run
 from protocol.scans import AnyScan
 

@@ -25,20 +25,11 @@ import zmq
 
 from protocol.errors import Code, UmbraError
 from protocol.keys import ClientKeys
-from protocol.messages import (
-    DEFAULT_COMMAND,
-    PROTOCOL,
-    AnyCommand,
-    AnyEvent,
-    AnyReply,
-    Event,
-    Logged,
-    PreviewTaken,
-    Reply,
-    Request,
-    Response,
-    Welcome,
-)
+from protocol.messages.access import DEFAULT_COMMAND
+from protocol.messages.commands import AnyCommand
+from protocol.messages.envelopes import PROTOCOL, Event, Request, Response
+from protocol.messages.events import AnyEvent, Logged, PreviewTaken
+from protocol.messages.replies import AnyReply, Reply, Welcome
 from protocol.wire import Arrays, arrays_of, decode, encode
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from protocol.arrivals import place_in
 from protocol.errors import Code, UmbraError
 from protocol.following import SILENCE_S, Following
-from protocol.messages import Progress, RunInfo, RunState
+from protocol.messages.runs import Progress, RunInfo, RunState
 from protocol.results import Separation
 
 if TYPE_CHECKING:

@@ -28,7 +28,8 @@ from daemon.rig import Rig
 from daemon.store import Store
 from drivers.base import CameraInfo, DeviceError
 from protocol.errors import Code, UmbraError
-from protocol.messages import Check, Health
+from protocol.messages.findings import Check
+from protocol.messages.rig import Health
 
 _LEASE_S = 120.0
 

@@ -22,7 +22,7 @@ from drivers.base import (
 )
 from drivers.clock import NS, Clock
 from drivers.sequence import mismatch
-from protocol.messages import Check
+from protocol.messages.findings import Check
 
 SHOTS = 4
 SETTLE_S = 0.3

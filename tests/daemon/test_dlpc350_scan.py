@@ -31,7 +31,7 @@ from drivers.virtual.geometry import Pinhole
 from drivers.virtual.scene import TARGET
 from drivers.virtual.timeline import Timeline
 from protocol.errors import Code
-from protocol.messages import End, RunState
+from protocol.messages.runs import End, RunState
 from protocol.scans import Checkerboard, Sinusoid
 from tests.drivers.dlpc350_peer import Board, Usb
 

@@ -30,7 +30,7 @@ from daemon.scans.pattern_scan import response_of
 from daemon.sequencer import Sequencer, exposer_for
 from drivers.base import CameraSettings
 from drivers.clock import NS, Clock
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 from protocol.scans import Radiometry, TwoImage
 
 RIG = """

@@ -14,7 +14,7 @@ from daemon.preconditions import LightWatch, Precondition, Preconditions
 from drivers.base import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunState, Waiting
+from protocol.messages.runs import RunState, Waiting
 from protocol.scans import Ready
 
 

@@ -25,7 +25,9 @@ from daemon.separation.estimator import Components, Observation
 from daemon.store import RunFolder, Store
 from drivers.base import CameraInfo, PixelFormat, ProjectorInfo, StageInfo
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, Product, Progressed, Reprocess, RunState
+from protocol.messages.commands import Reprocess
+from protocol.messages.events import AnyEvent, Progressed
+from protocol.messages.runs import Product, RunState
 from protocol.scans import (
     AnyScan,
     CalibrateLeak,

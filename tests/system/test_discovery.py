@@ -12,7 +12,8 @@ import pytest
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import Health, Search
+from protocol.messages.findings import Search
+from protocol.messages.rig import Health
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system

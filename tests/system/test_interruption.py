@@ -14,7 +14,7 @@ from daemon.scans.method import Bench
 from daemon.separation.estimator import Components
 from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system

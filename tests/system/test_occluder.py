@@ -11,7 +11,8 @@ import pytest
 import umbra
 from daemon.frames import FrameStore
 from daemon.separation.estimator import Components
-from protocol.messages import RunState, StageState
+from protocol.messages.rig import StageState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system
