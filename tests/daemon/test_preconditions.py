@@ -9,8 +9,8 @@ import pytest
 
 from daemon.control import Control
 from daemon.devicethread import Revoked, Session
-from daemon.metering import Level
 from daemon.preconditions import LightWatch, Precondition, Preconditions
+from daemon.separation.metering import Level
 from drivers.base import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
