@@ -6,24 +6,21 @@ A method here says what to send and what the answer becomes. `Client` has it as 
 
 from __future__ import annotations
 
-import functools
-import inspect
-from collections.abc import Callable, Coroutine, Mapping
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Concatenate,
-    Generic,
-    Literal,
-    ParamSpec,
-    TypeVar,
-    cast,
-    overload,
-)
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import msgspec
 
-from protocol.connection import Ask, checked, expect
+from protocol.bothways import command
+from protocol.connection import (
+    Ask,
+    GivenKeys,
+    checked,
+    chosen_endpoint,
+    chosen_keys,
+    expect,
+    own_name,
+)
 from protocol.errors import Code, UmbraError
 from protocol.messages import commands, replies
 from protocol.messages.findings import Check, Search
@@ -45,16 +42,8 @@ from protocol.results import (
 )
 from protocol.scans import AnyScan, SingleImage, Spec
 
-if TYPE_CHECKING:
-    from protocol.aio import AsyncClient
-    from protocol.client import Client
-
-P = ParamSpec("P")
-T = TypeVar("T")
-
 SLOW_S = 30.0
 """The least time-out of a command whose own work takes time: an exposure, a large array."""
-
 
 EXPOSE_S = 60.0
 """Ten exposures of the longest that auto-exposure takes by itself, and their readouts."""
@@ -63,49 +52,25 @@ EXAMINE_S = 180.0
 """An examination exposes, flips and writes: seconds, and a minute with devices that time out."""
 
 
-class command(Generic[P, T]):  # noqa: N801  (a decorator, as property is)
-    """Makes a function that returns an Ask into a method of both clients."""
-
-    def __init__(self, make: Callable[Concatenate[Any, P], Ask[T]]) -> None:
-        functools.update_wrapper(cast("Any", self), make)
-        self._make = make
-
-    @overload
-    def __get__(self, rig: None, owner: type) -> Callable[Concatenate[Any, P], Ask[T]]: ...
-    @overload
-    def __get__(self, rig: Client, owner: type) -> Callable[P, T]: ...
-    @overload
-    def __get__(self, rig: AsyncClient, owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
-    def __get__(self, rig: Any, owner: type) -> Any:
-        if rig is None:
-            return self._make
-
-        @functools.wraps(self._make)
-        def call(*args: P.args, **kwargs: P.kwargs) -> Any:
-            return rig.perform(self._make(rig, *args, **kwargs))
-
-        call.__signature__ = _bound(self._make)  # type: ignore[attr-defined]
-        return call
-
-
-@functools.cache
-def _bound(make: Callable[..., Any]) -> inspect.Signature:
-    """The signature that a person sees: without self, and with what comes back."""
-    whole = inspect.signature(make)
-    back = str(whole.return_annotation).removeprefix("Ask[").removesuffix("]")
-    return whole.replace(parameters=list(whole.parameters.values())[1:], return_annotation=back)
-
-
-# ---------------------------------------------------------------- the commands
-
-
 class Commands:
     """The methods that both clients have. Each raises UmbraError with the daemon's reason.
 
     `run` is a run's id; "" means the current run (or, to read, else the newest).
     """
 
-    name: str  # who asks, for the rig's records
+    def __init__(
+        self,
+        endpoint: str | None,
+        keys: GivenKeys,
+        timeout_s: float,
+        name: str,
+    ) -> None:
+        """Which rig, and who asks: see `protocol.client.connect`."""
+        self.endpoint = chosen_endpoint(endpoint)
+        self.keys = chosen_keys(keys, self.endpoint)
+        self.timeout_s = timeout_s
+        self.name = name or own_name()  # for the rig's records
+        self.token = ""  # of the lock, while this client holds it
 
     @command
     def hello(self) -> Ask[replies.Welcome]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import protocol.aio
+import protocol.aio_run
 import protocol.run
 from protocol.aio import AsyncClient
 from protocol.client import Client
@@ -40,14 +40,14 @@ def rig(fake: FakeRig) -> Iterator[Client]:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only an event can make a follower ask."""
-    for module in (protocol.run, protocol.aio):
+    for module in (protocol.run, protocol.aio_run):
         monkeypatch.setattr(module, "SILENCE_S", NEVER_S)
 
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A follower asks all the time."""
-    for module in (protocol.run, protocol.aio):
+    for module in (protocol.run, protocol.aio_run):
         monkeypatch.setattr(module, "SILENCE_S", 0.02)
 
 
