@@ -21,8 +21,8 @@ from daemon.scans.pattern_scan import response_of
 from daemon.server import Answer, Asked
 from daemon.store import Store
 from daemon.viewfinder import facts_of
-from drivers.base import CameraSettings as DriverSettings
-from drivers.base import PixelFormat
+from drivers.base.camera import CameraSettings as DriverSettings
+from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
 from protocol.messages import commands, replies
 from protocol.messages.rig import CameraSettings

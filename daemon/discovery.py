@@ -19,7 +19,8 @@ import structlog
 
 from daemon.config import DeviceTable
 from drivers import registry
-from drivers.base import Device, DeviceError
+from drivers.base.device import Device
+from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages.findings import Found, Search
 from protocol.messages.rig import DeviceInfo

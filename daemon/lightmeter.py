@@ -19,7 +19,7 @@ from daemon.separation.exposure import LONGEST_US, Limits
 from daemon.separation.metering import Exposure, Level, choose, level_of
 from daemon.separation.radiometry import Response
 from daemon.snapshot import snap_whole
-from drivers.base import CameraInfo, CameraSettings, Frame
+from drivers.base.camera import CameraInfo, CameraSettings, Frame
 from drivers.clock import NS
 from protocol.patterns import WHITE
 from protocol.scans import CalibrateDark, OccluderScan, Spec

@@ -30,7 +30,8 @@ from daemon.separation.metering import Exposure, Level, choose, level_of
 from daemon.separation.radiometry import Response
 from daemon.snapshot import snap, snap_whole
 from daemon.viewfinder import Viewfinder
-from drivers.base import Camera, CameraInfo, CameraSettings, DeviceError, Frame
+from drivers.base.camera import Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages.events import AnyEvent
 from protocol.messages.rig import LockInfo

@@ -20,9 +20,10 @@ import structlog
 
 from daemon.devicethread import DeviceThread, Revoked, Session
 from daemon.rig import Rig
-from drivers.base import DeviceError, Stage
-from drivers.base import StageState as DriverState
-from drivers.base import StageStatus as DriverStatus
+from drivers.base.errors import DeviceError
+from drivers.base.stage import Stage
+from drivers.base.stage import StageState as DriverState
+from drivers.base.stage import StageStatus as DriverStatus
 from protocol.errors import Code, UmbraError
 from protocol.messages.events import AnyEvent, StageChanged
 from protocol.messages.replies import StageStatus

@@ -22,7 +22,7 @@ from daemon.control import Control
 from daemon.devicethread import Session
 from daemon.failures import as_error
 from daemon.separation.metering import Level
-from drivers.base import DeviceError
+from drivers.base.errors import DeviceError
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import Waiting

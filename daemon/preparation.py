@@ -30,7 +30,8 @@ from daemon.scans.pattern_scan import response_of
 from daemon.separation.metering import Exposure, Level
 from daemon.store import RunFolder, Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
-from drivers.base import CameraSettings, DeviceError
+from drivers.base.camera import CameraSettings
+from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import Waiting
 from protocol.scans import AnyScan, OccluderScan, Radiometry, Scan

@@ -11,7 +11,7 @@ from daemon.control import Control
 from daemon.devicethread import Revoked, Session
 from daemon.preconditions import LightWatch, Precondition, Preconditions
 from daemon.separation.metering import Level
-from drivers.base import DeviceError, DeviceLost, DeviceRefused
+from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import RunState, Waiting

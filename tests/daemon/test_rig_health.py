@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from daemon import config
 from daemon.rig import Rig
-from drivers.base import DeviceLost
+from drivers.base.errors import DeviceLost
 from protocol.messages.rig import DeviceInfo, Health
 
 

@@ -13,7 +13,7 @@ import zmq
 import zmq.asyncio
 
 from daemon.server import Answer, Caller, Server
-from drivers.base import DeviceLost
+from drivers.base.errors import DeviceLost
 from protocol import wire
 from protocol.errors import Code, UmbraError
 from protocol.messages.access import Role

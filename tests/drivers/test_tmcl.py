@@ -15,16 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    StageState,
-    StageStatus,
-)
+from drivers.base.device import Context
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.stage import StageState, StageStatus
 from drivers.tmcl import TmclOptions, TmclStage
 from drivers.tmcl_protocol import checksum, encode, find_answer
 from tests.drivers.tmcl_peer import TmclPeer

@@ -20,7 +20,8 @@ pytestmark = pytest.mark.system
 
 DRIVERS = """
 import os, threading
-from drivers.base import DeviceRefused, Options
+from drivers.base.errors import DeviceRefused
+from drivers.base.device import Options
 from drivers.virtual.camera import VirtualCamera
 
 class Needy(Options, frozen=True, kw_only=True):
