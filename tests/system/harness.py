@@ -11,7 +11,7 @@ from pathlib import Path
 
 import umbra
 from protocol.errors import UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 from tests.system import warm
 
 READY_S = 60.0
