@@ -16,7 +16,7 @@ import msgspec
 from daemon.store import RunFolder, Store
 from protocol.errors import UmbraError
 from protocol.messages.runs import RunState
-from protocol.scans import Calibration
+from protocol.scans.calibrations import Calibration
 
 PRODUCT = "calibration"
 """The name of the product that has the figures; what applies is under its key `values`."""

@@ -44,7 +44,9 @@ from drivers.base.errors import DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import End, Progress, RunState
-from protocol.scans import AnyScan, OccluderScan, PatternScan
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import OccluderScan
+from protocol.scans.projected import PatternScan
 
 _ROOM_S = 1.0
 _RESULT_S = 30.0

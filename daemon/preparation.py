@@ -34,7 +34,9 @@ from drivers.base.camera import CameraSettings
 from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import Waiting
-from protocol.scans import AnyScan, OccluderScan, Radiometry, Scan
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import OccluderScan
+from protocol.scans.spec import Radiometry, Scan
 
 log = structlog.get_logger(__name__)
 

@@ -38,7 +38,7 @@ from daemon.store import RunFolder
 from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import Product
-from protocol.scans import Scan
+from protocol.scans.spec import Scan
 
 PREVIEW_WIDTH = 640
 REPORT_WIDTH = 1440

@@ -23,7 +23,9 @@ from daemon.quality import BITS, Bit
 from daemon.separation.finish import ADVICE
 from daemon.store import RunFile
 from protocol.messages.runs import Product
-from protocol.scans import AnyScan, OccluderScan, PatternScan
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import OccluderScan
+from protocol.scans.projected import PatternScan
 
 _ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a line of advice
 _DIM_BELOW = 0.25  # of full scale: a scene that uses less than this is under-exposed

@@ -36,7 +36,8 @@ from daemon.separation.estimator import Components, NotYet, Result
 from daemon.store import RunFile, RunFolder, Store, estimate_bytes
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import End, Progress, RunState
-from protocol.scans import AnyScan, Mesh
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import Mesh
 
 _PROGRESS_S = 0.1
 _RATE_FRAMES = 20

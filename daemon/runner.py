@@ -29,7 +29,7 @@ from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages.events import AnyEvent, Progressed, QueueChanged, RunChanged
 from protocol.messages.runs import End, Progress, RunState
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 
 _UNFINISHED = {RunState.WAITING, RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}
 _RESUMABLE_CODES = {

@@ -35,7 +35,7 @@ from drivers.clock import NS, Clock, RealClock
 from protocol.errors import Code, UmbraError
 from protocol.messages.envelopes import PROTOCOL
 from protocol.messages.runs import End, Product, RunInfo, RunState
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 
 FORMAT = 1
 """Of run.json; a daemon reads its own and refuses later ones."""

@@ -12,7 +12,7 @@ import structlog.testing
 from daemon import aftermath, config
 from daemon.store import RunFolder, Store
 from protocol.messages.runs import End, RunState
-from protocol.scans import TwoImage
+from protocol.scans.projected import TwoImage
 
 RIG = """
 camera = {{driver = "virtual"}}

@@ -16,7 +16,7 @@ from daemon import measured
 from daemon.plot import as_csv, as_svg
 from daemon.separation.estimator import Curve, Measurement, Plot
 from daemon.store import RunFolder, Store
-from protocol.scans import CalibrateLeak
+from protocol.scans.calibrations import CalibrateLeak
 
 X = np.asarray([1.0, 2.0, 4.0, 8.0])
 PLOT = Plot(

@@ -17,7 +17,7 @@ from daemon.separation.estimator import Components, Observation, Quality
 from daemon.store import RunFolder, Store
 from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 
 SIZE = (24, 32)
 

@@ -31,18 +31,11 @@ from protocol.errors import Code, UmbraError
 from protocol.messages.commands import Reprocess
 from protocol.messages.events import AnyEvent, Progressed
 from protocol.messages.runs import Product, RunState
-from protocol.scans import (
-    AnyScan,
-    CalibrateLeak,
-    Checkerboard,
-    GrayCode,
-    Mesh,
-    Radiometry,
-    SingleImage,
-    Sinusoid,
-    Stick,
-    TwoImage,
-)
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.calibrations import CalibrateLeak
+from protocol.scans.occluded import Mesh, Stick
+from protocol.scans.projected import Checkerboard, GrayCode, SingleImage, Sinusoid, TwoImage
+from protocol.scans.spec import Radiometry
 
 Frames = Iterable[NDArray[Any] | None]
 
