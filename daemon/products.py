@@ -25,12 +25,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon import measured, report
+from daemon import measured
 from daemon.display import Picture, common_white, for_display, frame_light
 from daemon.durable import Damaged
 from daemon.frames import FrameRecord, FrameStore, NoPixels
 from daemon.preview import side_by_side
 from daemon.quality import BITS, overlay
+from daemon.report.separation import Subject, render
 from daemon.separation.estimator import Components, Lighting, Measurement, Result
 from daemon.separation.single import block_mean
 from daemon.staging import Staging, as_json, encoded, tiff
@@ -95,8 +96,8 @@ def write(
         staging.add("facts", "facts", "quality.json", as_json(facts))
         preview = side_by_side({name: for_preview(picture) for name, picture in found.items()})
         staging.add("preview", "picture", "preview.png", encoded(".png", preview[..., ::-1]))
-        page = report.render(
-            report.Subject(
+        page = render(
+            Subject(
                 file=file,
                 facts=facts,
                 pictures=found,

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon import report
 from daemon.frames import FrameRecord
+from daemon.report import separation as report
 from daemon.separation.estimator import Observation
 from daemon.store import RunFile
 from protocol.messages.runs import Product, RunState
