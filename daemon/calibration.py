@@ -13,7 +13,8 @@ from typing import Any
 
 import msgspec
 
-from daemon.store import RunFolder, Store
+from daemon.runfolder import RunFolder
+from daemon.store import Store
 from protocol.errors import UmbraError
 from protocol.messages.runs import RunState
 from protocol.scans.calibrations import Calibration

@@ -33,11 +33,12 @@ from daemon.preparation import Preparation
 from daemon.recorder import Exposed, Recorder, Tally
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Ring
+from daemon.runfolder import RunFolder
 from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet, Result
 from daemon.sequencer import Sequencer, exposer_for
 from daemon.standing import Standing
-from daemon.store import RunFolder, Store
+from daemon.store import Store
 from daemon.viewfinder import Viewfinder
 from drivers.base.camera import CameraInfo
 from drivers.base.errors import DeviceError

@@ -17,9 +17,9 @@ from daemon.durable import Damaged
 from daemon.frames import FrameRecord
 from daemon.plot import as_csv
 from daemon.report.measurement import render
+from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Measurement
 from daemon.staging import Staging, as_json, tiff
-from daemon.store import RunFolder
 from protocol.messages.runs import Product
 
 FACTS = ("calibration", "measurement")

@@ -24,11 +24,12 @@ from daemon.lightmeter import LightMeter, require_meterable
 from daemon.motion import require_homed
 from daemon.preconditions import LightWatch, Precondition, Preconditions
 from daemon.rig import Rig
+from daemon.runfolder import RunFolder
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Method
 from daemon.scans.pattern_scan import response_of
 from daemon.separation.metering import Exposure, Level
-from daemon.store import RunFolder, Store, estimate_bytes
+from daemon.store import Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
 from drivers.base.camera import CameraSettings
 from drivers.base.errors import DeviceError

@@ -32,10 +32,10 @@ from daemon.frames import FrameRecord, FrameStore, NoPixels
 from daemon.preview import side_by_side
 from daemon.quality import BITS, overlay
 from daemon.report.separation import Subject, render
+from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Components, Lighting, Measurement, Result
 from daemon.separation.single import block_mean
 from daemon.staging import Staging, as_json, encoded, tiff
-from daemon.store import RunFolder
 from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import Product

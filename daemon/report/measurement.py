@@ -22,8 +22,8 @@ from daemon.report.page import (
     template,
     timed,
 )
+from daemon.runfolder import RunFile
 from daemon.separation.estimator import Measurement
-from daemon.store import RunFile
 from protocol.messages.runs import Product
 
 

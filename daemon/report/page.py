@@ -14,7 +14,7 @@ import msgspec
 
 from daemon.frames import FrameRecord
 from daemon.report.words import frames, in_words, ranges, size
-from daemon.store import RunFile
+from daemon.runfolder import RunFile
 from protocol.messages.runs import Product
 from protocol.scans.anyscan import AnyScan
 

@@ -30,8 +30,8 @@ from daemon.report.page import (
     told,
 )
 from daemon.report.words import frames, lower, percent
+from daemon.runfolder import RunFile
 from daemon.separation.finish import ADVICE
-from daemon.store import RunFile
 from protocol.messages.runs import Product
 from protocol.scans.occluded import OccluderScan
 from protocol.scans.projected import PatternScan

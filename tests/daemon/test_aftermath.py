@@ -10,7 +10,8 @@ import pytest
 import structlog.testing
 
 from daemon import aftermath, config
-from daemon.store import RunFolder, Store
+from daemon.runfolder import RunFolder
+from daemon.store import Store
 from protocol.messages.runs import End, RunState
 from protocol.scans.projected import TwoImage
 

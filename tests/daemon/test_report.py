@@ -7,8 +7,8 @@ import pytest
 
 from daemon.frames import FrameRecord
 from daemon.report import separation as report
+from daemon.runfolder import RunFile
 from daemon.separation.estimator import Observation
-from daemon.store import RunFile
 from protocol.messages.runs import Product, RunState
 from protocol.scans.anyscan import AnyScan
 from protocol.scans.occluded import Mesh, Stick

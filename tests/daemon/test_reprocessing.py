@@ -19,10 +19,11 @@ from daemon import aftermath, config, products
 from daemon.frames import FrameRecord, FrameStore
 from daemon.reprocessing import Reprocessing, method_of
 from daemon.reprocessor import Reprocessor
+from daemon.runfolder import RunFolder
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, Observation
-from daemon.store import RunFolder, Store
+from daemon.store import Store
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
