@@ -20,11 +20,12 @@ from daemon.manual import Manual
 from daemon.publisher import Publisher
 from daemon.reprocessor import Reprocessor
 from daemon.rig import SAFE_S, Rig
+from daemon.runfolder import RunFolder
 from daemon.runner import Runner
 from daemon.scans import catalog
 from daemon.separation.estimator import Components, Result
 from daemon.server import Answer, Asked, Caller
-from daemon.store import RunFolder, Store
+from daemon.store import Store
 from daemon.viewfinder import Glimpse, Viewfinder, cells
 from protocol.errors import Code, UmbraError
 from protocol.messages import commands, replies

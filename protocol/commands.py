@@ -40,7 +40,9 @@ from protocol.results import (
     separation_of,
     stage_of,
 )
-from protocol.scans import AnyScan, SingleImage, Spec
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import SingleImage
+from protocol.scans.spec import Spec
 
 SLOW_S = 30.0
 """The least time-out of a command whose own work takes time: an exposure, a large array."""

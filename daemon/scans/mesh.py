@@ -12,7 +12,8 @@ from daemon.scans.occluder import OccluderMethod
 from daemon.separation.estimator import Components, Estimator
 from daemon.separation.mesh import MeshOccluder
 from protocol import mesh as geometry
-from protocol.scans import Mesh, Reference
+from protocol.scans.occluded import Mesh
+from protocol.scans.spec import Reference
 
 _RATE_HZ = 30.0  # where neither the scan nor the camera says
 _EXPOSURE_S = 0.01

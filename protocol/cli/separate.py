@@ -23,7 +23,9 @@ from protocol.cli.words import Fetched, frames
 from protocol.errors import Code, UmbraError
 from protocol.messages.rig import Health
 from protocol.messages.runs import RunInfo
-from protocol.scans import AnySeparation, PatternScan, Reference
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import PatternScan
+from protocol.scans.spec import Reference
 
 if TYPE_CHECKING:
     from protocol.client import Client

@@ -10,7 +10,8 @@ from protocol.messages.access import Role
 from protocol.messages.rig import CameraSettings
 from protocol.messages.runs import RunState
 from protocol.patterns import AnyPattern
-from protocol.scans import AnyScan, SingleImage
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import SingleImage
 
 
 class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):

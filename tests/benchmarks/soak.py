@@ -14,7 +14,7 @@ from collections import Counter
 from pathlib import Path
 
 from protocol.messages.runs import RunInfo, RunState
-from protocol.scans import Mesh
+from protocol.scans.occluded import Mesh
 from tests.benchmarks.bench import Running, daemon
 from tests.benchmarks.ratio import Ratio
 

@@ -20,7 +20,7 @@ from drivers.clock import NS, Clock
 from drivers.registry import build
 from drivers.virtual.camera import VirtualCamera
 from drivers.virtual.stage import VirtualStage
-from protocol.scans import Mesh, Stick
+from protocol.scans.occluded import Mesh, Stick
 
 
 class Jumping(Clock):

@@ -22,7 +22,7 @@ from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
 from protocol.patterns import BLACK
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 
 FULL = 65535
 OWN_US = 10_000.0

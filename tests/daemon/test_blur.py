@@ -9,7 +9,8 @@ import pytest
 from daemon import patterns
 from daemon.separation import blur
 from protocol.patterns import Sinusoid as Wave
-from protocol.scans import Radiometry, Sinusoid
+from protocol.scans.projected import Sinusoid
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import Scene
 
 

@@ -26,7 +26,7 @@ from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.stage import StageInfo
 from protocol.mesh import Mesh as Holes
-from protocol.scans import Mesh
+from protocol.scans.occluded import Mesh
 
 HEIGHT, WIDTH = 156, 208
 PITCH = 20.0

@@ -23,18 +23,17 @@ from daemon.separation.single import block_mean
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from protocol.patterns import Axis
-from protocol.scans import (
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
     PatternScan,
-    Radiometry,
     RandomBinary,
     RandomPhase,
-    Reference,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry, Reference
 from tests.daemon.scene import Scene
 
 Frames = list[NDArray[np.uint16]]

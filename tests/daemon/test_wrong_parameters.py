@@ -16,18 +16,16 @@ from daemon.separation.estimator import Components, Lighting, Quality
 from daemon.separation.frameset import UNCHECKED
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
-from protocol.scans import (
-    AnyScan,
-    AnySeparation,
+from protocol.scans.anyscan import AnyScan, AnySeparation
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Radiometry,
     RandomBinary,
     RandomPhase,
-    Reference,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry, Reference
 from tests.daemon.scene import Scene
 
 LIGHT = Radiometry(leakage=0.02)

@@ -23,7 +23,7 @@ from drivers.virtual.geometry import Pinhole
 from drivers.virtual.scene import TARGET
 from drivers.virtual.transport import Transport, transport
 from drivers.virtual.view import View, view
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 
 FULL = 4095
 BLACK = 64

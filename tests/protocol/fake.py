@@ -26,7 +26,7 @@ from protocol.messages.events import AnyEvent, RunChanged
 from protocol.messages.findings import Check, Search
 from protocol.messages.rig import RigState, StageState
 from protocol.messages.runs import End, Product, RunInfo, RunState
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 from protocol.wire import Arrays, decode, encode, headers
 
 T = TypeVar("T")

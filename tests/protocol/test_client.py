@@ -30,7 +30,7 @@ from protocol.messages.findings import Search
 from protocol.messages.runs import End, RunInfo, RunState
 from protocol.patterns import WHITE
 from protocol.results import separation_of
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 from tests.protocol.fake import STAGE, FakeRig
 
 Connect = Callable[..., Client]

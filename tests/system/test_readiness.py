@@ -18,7 +18,7 @@ from protocol.messages.replies import Status
 from protocol.messages.rig import RigState
 from protocol.messages.runs import RunState
 from protocol.run import Run
-from protocol.scans import Ready
+from protocol.scans.spec import Ready
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system
