@@ -16,12 +16,11 @@ import umbra
 from daemon.frames import FrameStore
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import RunState
-from tests.system.harness import Daemon, recorded, until
+from tests.system.harness import ENDLESS, FAST, Daemon, recorded, until
 from tests.system.test_occluder import configured
 
 pytestmark = pytest.mark.system
 
-FAST = 20
 LONG = umbra.Checkerboard(average=6)
 
 
@@ -127,7 +126,7 @@ def test_beside_the_queue_through_a_kill_and_an_emergency_stop(daemon: Daemon) -
     with daemon.start() as rig:
         parent = rig.scan(LONG)
         parent.wait(60)
-        scans = [rig.scan(umbra.Checkerboard(average=500)).id for _ in range(2)]
+        scans = [rig.scan(ENDLESS).id for _ in range(2)]
         recorded(rig, scans[0], 5)
         made = [rig.reprocess(parent, note=f"number {n}") for n in range(4)]
         assert [run.id for run in rig.queue()] == [scans[1]]
