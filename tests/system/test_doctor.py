@@ -59,7 +59,7 @@ def test_a_camera_that_hears_no_trigger(daemon: Daemon) -> None:
 
 
 def test_a_wire_that_loses_a_pulse(daemon: Daemon) -> None:
-    daemon.configure(camera='faults = ["drop-trigger@9"]\nexposure_us = 10000', scale=1)
+    daemon.configure(camera='faults = ["drop-trigger:pulse@2"]\nexposure_us = 10000', scale=1)
     with daemon.start() as rig:
         found = {c.name: c for c in rig.examine()}
         assert found["camera: trigger"].outcome is Outcome.OK
