@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 
 import pytest
 
 # As many processes as cores run tests, and some start daemons: threads of a linear algebra
 # library would spin for cores that others need. Read where NumPy is first imported, here or there.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Containers often forbid bytecode; every process that a test starts would compile all of Umbra anew
+# then, which takes longer than most tests of one.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 
 def pytest_runtest_setup() -> None:

@@ -75,6 +75,7 @@ def drivers(daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         "\n".join(["[umbra.drivers]", *points, missing, ""])
     )
     monkeypatch.setenv("PYTHONPATH", str(package))
+    daemon.cold = True  # Python reads that as it starts
     text = daemon.config.read_text()
     text = text.replace(
         '[camera]\ndriver = "virtual"', '[camera]\ndriver = "mine"\nserial = "mine-1"'

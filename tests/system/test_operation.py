@@ -230,7 +230,7 @@ def test_a_full_disk_is_said_before_the_scan(daemon: Daemon) -> None:
 
 
 def test_stopping_with_the_parent(daemon: Daemon) -> None:
-    process = daemon.launch("--until-eof", stdin=subprocess.PIPE)
+    process = daemon.launch_cold("--until-eof", stdin=subprocess.PIPE)
     with daemon.connect():
         assert process.stdin is not None
         process.stdin.close()
@@ -239,7 +239,7 @@ def test_stopping_with_the_parent(daemon: Daemon) -> None:
 
 def test_a_bad_configuration_exits_with_2(daemon: Daemon) -> None:
     daemon.config.write_text("[camera]\ndriver = 'virtual'\nwdth = 3\n")
-    assert daemon.launch().wait(60) == 2
+    assert daemon.launch_cold().wait(60) == 2
     assert daemon.log().strip() == f"umbrad: {daemon.config}: camera.wdth: there is no such key"
 
 
