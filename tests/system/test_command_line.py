@@ -123,7 +123,10 @@ def test_demo(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [*UMBRA, "demo", "-o", "out"], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+        [*UMBRA, "demo", "-o", "out", "--speed", "0.2"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert process.stderr is not None
     for line in process.stderr:
