@@ -310,11 +310,12 @@ def test_photographs_of_exported_patterns_are_separated_by_the_command_that_is_t
         levels = image[..., None] / 255.0
         seen = direct * levels + smooth * levels.mean()
         photograph = taken.get(file.name, tmp_path / "photos" / file.name)
-        cv2.imwrite(str(photograph), np.rint(257 * seen[..., ::-1]).astype(np.uint16))
+        cv2.imwrite(str(photograph), np.rint(16 * seen[..., ::-1]).astype(np.uint16))
     named = {"PHOTOS": "photos", "BLACK": "black.png", "WHITE": "white.png", "OUT": "out"}
     words = [named.get(word, word) for word in told["command"].split()]
-    done = umbra(*words[1:], cwd=tmp_path)
+    done = umbra(*words[1:], "--depth", "12", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = read(tmp_path / "out" / "direct.tiff")
-    np.testing.assert_allclose(found, 257 * direct, atol=300)
+    np.testing.assert_allclose(found, 16 * direct, atol=20)
+    assert json.loads((tmp_path / "out" / "quality.json").read_text())["full_scale"] == 4095
     assert_no_orphan(tmp_path)
