@@ -17,7 +17,8 @@ from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
 from protocol.patterns import AnyPattern
-from protocol.scans import AnyScan, PatternScan
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import PatternScan
 
 _CAMERA = CameraInfo(width=4096, height=4096, pixel_format=PixelFormat("Mono8"))
 """Stands for the one that will look, of which patterns know nothing."""

@@ -18,7 +18,7 @@ from protocol.cli.private import private_daemon
 from protocol.cli.runs import Force
 from protocol.errors import Code, UmbraError
 from protocol.patterns import Axis
-from protocol.scans import GrayCode, PatternScan
+from protocol.scans.projected import GrayCode, PatternScan
 
 SHOWN = {
     *("checker", "shift", "shifts", "periods", "phases", "axis", "weave", "patch", "seed"),

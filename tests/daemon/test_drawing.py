@@ -11,8 +11,10 @@ from daemon import patterns
 from daemon.drawing import draw
 from daemon.scans.method import Unsuitable
 from protocol.patterns import Checker, RandomPhase
-from protocol.scans import AnyScan, Checkerboard, GrayCode, Mesh
-from protocol.scans import RandomPhase as RandomPhaseScan
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import Mesh
+from protocol.scans.projected import Checkerboard, GrayCode
+from protocol.scans.projected import RandomPhase as RandomPhaseScan
 
 WIDTH, HEIGHT = 40, 24
 
