@@ -13,7 +13,7 @@ import structlog
 from daemon.config import HooksSection, RigConfig
 from daemon.store import RunFolder, Store
 from protocol.errors import UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 
 _DAY_S = 86_400.0
 

@@ -15,7 +15,7 @@ import msgspec
 
 from daemon.store import RunFolder, Store
 from protocol.errors import UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 from protocol.scans import Calibration
 
 PRODUCT = "calibration"

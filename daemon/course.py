@@ -39,10 +39,11 @@ from daemon.sequencer import Sequencer, exposer_for
 from daemon.standing import Standing
 from daemon.store import RunFolder, Store
 from daemon.viewfinder import Viewfinder
-from drivers.base import CameraInfo, DeviceError
+from drivers.base.camera import CameraInfo
+from drivers.base.errors import DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Progress, RunState
+from protocol.messages.runs import End, Progress, RunState
 from protocol.scans import AnyScan, OccluderScan, PatternScan
 
 _ROOM_S = 1.0

@@ -20,11 +20,14 @@ import structlog
 
 from daemon.devicethread import DeviceThread, Revoked, Session
 from daemon.rig import Rig
-from drivers.base import DeviceError, Stage
-from drivers.base import StageState as DriverState
-from drivers.base import StageStatus as DriverStatus
+from drivers.base.errors import DeviceError
+from drivers.base.stage import Stage
+from drivers.base.stage import StageState as DriverState
+from drivers.base.stage import StageStatus as DriverStatus
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, StageChanged, StageState, StageStatus
+from protocol.messages.events import AnyEvent, StageChanged
+from protocol.messages.replies import StageStatus
+from protocol.messages.rig import StageState
 
 CALL_S = 5.0
 """Deadline of a call that does not wait for the motion's end."""

@@ -21,7 +21,7 @@ from daemon.plot import as_csv, as_svg
 from daemon.separation.estimator import Measurement
 from daemon.staging import Staging, as_json, tiff
 from daemon.store import RunFile, RunFolder
-from protocol.messages import Product
+from protocol.messages.runs import Product
 
 FACTS = ("calibration", "measurement")
 

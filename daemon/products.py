@@ -35,9 +35,9 @@ from daemon.separation.estimator import Components, Lighting, Measurement, Resul
 from daemon.separation.single import block_mean
 from daemon.staging import Staging, as_json, encoded, tiff
 from daemon.store import RunFolder
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
-from protocol.messages import Product
+from protocol.messages.runs import Product
 from protocol.scans import Scan
 
 PREVIEW_WIDTH = 640

@@ -22,7 +22,7 @@ from daemon.frames import FrameRecord
 from daemon.quality import BITS, Bit
 from daemon.separation.finish import ADVICE
 from daemon.store import RunFile
-from protocol.messages import Product
+from protocol.messages.runs import Product
 from protocol.scans import AnyScan, OccluderScan, PatternScan
 
 _ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a line of advice

@@ -35,7 +35,7 @@ from daemon.scans.occluder import INCOMPLETE
 from daemon.separation.estimator import Components, NotYet, Result
 from daemon.store import RunFile, RunFolder, Store, estimate_bytes
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Progress, RunState
+from protocol.messages.runs import End, Progress, RunState
 from protocol.scans import AnyScan, Mesh
 
 _PROGRESS_S = 0.1

@@ -24,7 +24,9 @@ from daemon.reprocessing import Reprocessing, method_of, source_of
 from daemon.scans.method import Unsuitable
 from daemon.store import RunFile, RunFolder, Store
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, End, Progress, Progressed, Reprocess, RunChanged, RunState
+from protocol.messages.commands import Reprocess
+from protocol.messages.events import AnyEvent, Progressed, RunChanged
+from protocol.messages.runs import End, Progress, RunState
 from protocol.reading import changed
 
 _RESUMABLE_CODES = {Code.STORAGE_FULL, Code.STORAGE_FAILED}

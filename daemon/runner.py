@@ -25,17 +25,10 @@ from daemon.scans.catalog import method_for
 from daemon.scans.method import Unsuitable
 from daemon.store import RunFolder, Store
 from daemon.viewfinder import Viewfinder
-from drivers.base import DeviceError
+from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
-from protocol.messages import (
-    AnyEvent,
-    End,
-    Progress,
-    Progressed,
-    QueueChanged,
-    RunChanged,
-    RunState,
-)
+from protocol.messages.events import AnyEvent, Progressed, QueueChanged, RunChanged
+from protocol.messages.runs import End, Progress, RunState
 from protocol.scans import AnyScan
 
 _UNFINISHED = {RunState.WAITING, RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}

@@ -13,7 +13,7 @@ from daemon.scans.method import Method
 from daemon.store import RunFolder
 from drivers.clock import NS, Clock
 from protocol.errors import Code
-from protocol.messages import Progress, RunState, Waiting
+from protocol.messages.runs import Progress, RunState, Waiting
 
 _PROGRESS_S = 0.1
 _RATE_FRAMES = 20

@@ -33,7 +33,8 @@ from numpy.typing import DTypeLike
 from daemon.durable import Damaged, atomic_write, fsync_folder, storage
 from drivers.clock import NS, Clock, RealClock
 from protocol.errors import Code, UmbraError
-from protocol.messages import PROTOCOL, End, Product, RunInfo, RunState
+from protocol.messages.envelopes import PROTOCOL
+from protocol.messages.runs import End, Product, RunInfo, RunState
 from protocol.scans import AnyScan
 
 FORMAT = 1

@@ -24,15 +24,9 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Context,
-    DeviceLost,
-    DeviceRefused,
-    Identity,
-    Options,
-    Projector,
-    ProjectorInfo,
-)
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceLost, DeviceRefused
+from drivers.base.projector import Projector, ProjectorInfo
 from drivers.clock import NS
 from drivers.displaywindow import Call, DisplayOptions, DisplayWindow, Reply
 

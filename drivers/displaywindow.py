@@ -32,16 +32,9 @@ from numpy.typing import NDArray
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 import pygame
 
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceLost,
-    DeviceRefused,
-    Identity,
-    Options,
-    Projector,
-    ProjectorInfo,
-)
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused
+from drivers.base.projector import Projector, ProjectorInfo
 from drivers.clock import NS
 
 HINTS = {

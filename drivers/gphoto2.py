@@ -24,21 +24,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    Identity,
-    Options,
-)
+from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.clock import NS
 from drivers.gphoto2config import Config
 from drivers.imagefile import BadImage

@@ -25,20 +25,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    Identity,
-    Options,
-)
+from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceRefused, DeviceTimeout
 from drivers.clock import NS
 from drivers.devicetime import DeviceTime
 from drivers.unpack import Layout, unpack

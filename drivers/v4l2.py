@@ -21,19 +21,10 @@ from linuxpy.video import raw
 from numpy.typing import NDArray
 
 from drivers import imagefile
-from drivers.base import (
-    Acquisition,
-    CameraInfo,
-    CameraSettings,
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Identity,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, CameraInfo, CameraSettings
+from drivers.base.device import Context, Identity
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.pixelformat import PixelFormat
 from drivers.imagefile import BadImage
 from drivers.streaming import Buffer, StreamingCamera, StreamingOptions
 from drivers.unpack import Layout, Packing

@@ -18,7 +18,8 @@ from typing import Any
 
 from daemon.config import SequencerSection
 from daemon.scans.method import Bench, Unsuitable
-from drivers.base import CameraInfo, SequenceLimits
+from drivers.base.camera import CameraInfo
+from drivers.base.projector import SequenceLimits
 from protocol.scans import PatternScan, Spec
 
 GUARDS = 2

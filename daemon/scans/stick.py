@@ -8,7 +8,7 @@ from daemon.scans.method import Bench, Sweep, Unsuitable
 from daemon.scans.occluder import OccluderMethod
 from daemon.separation.coverage import Occluder
 from daemon.separation.estimator import Estimator
-from drivers.base import StageInfo
+from drivers.base.stage import StageInfo
 from protocol.patterns import Axis
 from protocol.scans import Stick
 

@@ -24,7 +24,7 @@ from daemon.separation.handedness import STRONG, Wave, strength
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import mirrored
-from daemon.separation.ripple import ripple
+from daemon.separation.ripple import Ripple, ripple
 from daemon.separation.scan_noise import ResidualNoise, Told
 from daemon.separation.steadiness import compare
 from daemon.separation.weave import Woven
@@ -43,7 +43,8 @@ _MISFIT = 5.0
 _DOUBTFUL = 2.0
 """Above this it is none where it is also a part of the wave: ..."""
 _DISTORTED = 0.05
-_RIPPLED = 0.03  # of the wave: with more of it in mean or amplitude, light was no sinusoid
+_BENT = 0.03  # of the wave: with more of it in its amplitude thrice a period, light was no sinusoid
+_ODD = 0.05  # with more of it in mean or amplitude once a period, frames are not of these phases
 _MANY = 0.2  # of the pixels
 _BLURRED = 0.03  # of direct light
 
@@ -151,7 +152,7 @@ class LeastSquares:
             **told,
             **steady,
             "misfit": None if misfit is None else round(misfit, 3),
-            "ripple": None if rippled is None else round(rippled, 4),
+            "ripple": [[round(one.tone, 4), round(one.frames, 4)] for one in rippled],
             "advice": [
                 *_advice(misfit, self._noise.distortion, disagreeing, rippled),
                 *self._unknown(blur),
@@ -277,15 +278,19 @@ class LeastSquares:
         even = bool(self._periods)
         return mirrored([wave], strength([wave], deviation), turning=even, smooth=even)
 
-    def _ripple(self, ready: list[_Fit], noise: Told) -> float | None:
-        """How much of the wave shows in its own mean and amplitude: see `ripple`."""
+    def _ripple(self, ready: list[_Fit], noise: Told) -> list[Ripple]:
+        """How much of the wave shows in its own mean and amplitude, where three phases leave no
+        residuals to say so."""
         found = []
         for fit in ready:
+            if fit.frames > 3:
+                continue
             mean, wave = fit.grey()
             deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
-            found.append(ripple(mean, wave, strength([wave], deviation) > np.float32(STRONG)))
-        known = [one for one in found if one is not None]
-        return max(known) if known else None
+            known = ripple(mean, wave, strength([wave], deviation) > np.float32(STRONG))
+            if known is not None:
+                found.append(known)
+        return found
 
     def _level(self, fit: _Fit, noise: Told) -> Plane:
         mean, _, _ = fit.solve()
@@ -388,7 +393,7 @@ def _disagree(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> NDArray[np.boo
 
 
 def _advice(
-    misfit: float | None, distortion: float | None, disagreeing: float, rippled: float | None
+    misfit: float | None, distortion: float | None, disagreeing: float, rippled: list[Ripple]
 ) -> list[str]:
     """What to do about frames that are no sinusoids in time; [] where they are."""
     lines = []
@@ -400,12 +405,16 @@ def _advice(
             "they are not the phases that were declared (--phases, --periods), the tone curve is "
             "not linear, or something moved"
         )
-    elif rippled is not None and rippled > _RIPPLED:
+    if (bent := max((one.tone for one in rippled), default=0.0)) > _BENT:
         lines.append(
-            f"the pattern itself shows in the components, by {rippled:.0%} of the wave: the "
+            f"the wave's amplitude goes up and down three times a period, by {bent:.0%}: the "
             "projector's or the camera's tone curve is not linear (run `umbra calibrate tone`, or "
-            "give the camera's curve with --tone), or the frames are not the phases that were "
-            "declared (--phases)"
+            "give the camera's curve with --tone)"
+        )
+    elif (odd := max((one.frames for one in rippled), default=0.0)) > _ODD:
+        lines.append(
+            f"the pattern itself shows in the components, by {odd:.0%} of the wave: the frames are "
+            "not thirds of a turn apart (--phases), or not of one exposure"
         )
     if disagreeing > _MANY:
         lines.append(

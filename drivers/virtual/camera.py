@@ -14,19 +14,10 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    Context,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    Identity,
-    Options,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.pixelformat import PixelFormat
 from drivers.clock import NS
 from drivers.virtual.device import VirtualDevice, VirtualOptions
 from drivers.virtual.faults import Fault

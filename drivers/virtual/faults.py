@@ -13,7 +13,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterable
 
-from drivers.base import DeviceGarbled, DeviceLost, DeviceTimeout
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceTimeout
 from drivers.clock import Clock
 
 PATTERN = re.compile(r"(?P<kind>[a-z-]+)(:(?P<act>[a-z_]+))?@(?P<call>[1-9]\d*)(\*(?P<times>\d+))?")

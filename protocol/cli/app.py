@@ -129,7 +129,7 @@ def _version(asked: bool) -> None:
     if asked:
         from importlib.metadata import version
 
-        from protocol.messages import PROTOCOL
+        from protocol.messages.envelopes import PROTOCOL
 
         typer.echo(f"umbra {version('umbra-rig')} (protocol {PROTOCOL})")
         raise typer.Exit

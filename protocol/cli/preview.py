@@ -19,7 +19,9 @@ from protocol.cli.delivery import write_file
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.output import on_terminal, print_json, say
 from protocol.errors import Code, UmbraError
-from protocol.messages import Picture, PreviewTaken, RigState
+from protocol.messages.events import PreviewTaken
+from protocol.messages.replies import Picture
+from protocol.messages.rig import RigState
 
 if TYPE_CHECKING:
     import numpy as np

@@ -21,7 +21,8 @@ from protocol.cli.runs import Force, fetch, wanted
 from protocol.cli.watch import follow, must_be_done, tell
 from protocol.cli.words import Fetched, frames
 from protocol.errors import Code, UmbraError
-from protocol.messages import Health, RunInfo
+from protocol.messages.rig import Health
+from protocol.messages.runs import RunInfo
 from protocol.scans import AnySeparation, PatternScan, Reference
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from daemon.scans import catalog
 from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 from protocol.scans import (
     AnyScan,
     Checkerboard,

@@ -25,7 +25,8 @@ import numpy as np
 
 from daemon.frames import FrameStore
 from drivers import registry
-from drivers.base import Acquisition, Camera, CameraSettings, Context
+from drivers.base.camera import Acquisition, Camera, CameraSettings
+from drivers.base.device import Context
 from protocol.scans import CalibrateTone, Stick
 from tests.benchmarks.bench import Running, daemon
 from tests.benchmarks.ratio import Ratio, Skipped

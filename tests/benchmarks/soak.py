@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from protocol.messages import RunInfo, RunState
+from protocol.messages.runs import RunInfo, RunState
 from protocol.scans import Mesh
 from tests.benchmarks.bench import Running, daemon
 from tests.benchmarks.ratio import Ratio

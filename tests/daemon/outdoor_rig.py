@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Circle, Method, Motion, Taken, Watch
 from daemon.separation.estimator import Components, Observation
-from drivers.base import Acquisition, Context
+from drivers.base.camera import Acquisition
+from drivers.base.device import Context
 from drivers.clock import NS, Clock
 from drivers.registry import build
 from drivers.virtual.camera import VirtualCamera

@@ -18,7 +18,9 @@ from daemon import patterns
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Taken
 from daemon.separation.estimator import Components
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.patterns import BLACK
 from protocol.scans import AnyScan
 

@@ -14,7 +14,9 @@ from daemon import patterns
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Taken
 from daemon.separation.estimator import Measurement, NotYet
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.cli.methods import METHODS
 from protocol.cli.options import build, options_of
 from protocol.scans import Advise, AnyScan

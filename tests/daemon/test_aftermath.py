@@ -11,7 +11,7 @@ import structlog.testing
 
 from daemon import aftermath, config
 from daemon.store import RunFolder, Store
-from protocol.messages import End, RunState
+from protocol.messages.runs import End, RunState
 from protocol.scans import TwoImage
 
 RIG = """

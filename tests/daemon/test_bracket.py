@@ -16,7 +16,9 @@ from daemon.separation.estimator import Components, Lighting, NotYet, Observatio
 from daemon.separation.exposure_noise import ExposureNoise, Sample, Sensor
 from daemon.separation.pair import ComplementPair
 from daemon.separation.radiometry import FrameMean, Response
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.scans import (
     AnySeparation,
     Checkerboard,

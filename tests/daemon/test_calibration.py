@@ -13,7 +13,7 @@ from daemon import measured
 from daemon.calibration import Calibrations
 from daemon.separation.estimator import Measurement
 from daemon.store import RunFolder, Store
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 from protocol.scans import (
     AnyScan,
     CalibrateDark,

@@ -6,7 +6,9 @@ import pytest
 
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Unsuitable
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.scans import TwoImage
 
 BENCH = Bench(

@@ -28,9 +28,9 @@ from daemon.scans.catalog import method_for
 from daemon.scans.method import Circle, Method, Unsuitable, Watch
 from daemon.scans.pattern_scan import response_of
 from daemon.sequencer import Sequencer, exposer_for
-from drivers.base import CameraSettings
+from drivers.base.camera import CameraSettings
 from drivers.clock import NS, Clock
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 from protocol.scans import Radiometry, TwoImage
 
 RIG = """

@@ -9,7 +9,9 @@ import pytest
 from daemon.config import SequencerSection
 from daemon.exposing.modes import GUARDS, Mode, choose, pace, whole_periods
 from daemon.scans.method import Bench, Unsuitable
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo, SequenceLimits
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo, SequenceLimits
 from protocol.scans import Checkerboard, Mesh
 
 EXPOSURE_US = 5000.0

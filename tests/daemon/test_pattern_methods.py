@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Components, Quality
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 from protocol.patterns import Axis
 from protocol.scans import (
     AnyScan,

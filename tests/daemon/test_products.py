@@ -15,7 +15,7 @@ from daemon.frames import FrameRecord, FrameStore
 from daemon.quality import BITS, overlay
 from daemon.separation.estimator import Components, Observation, Quality
 from daemon.store import RunFolder, Store
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
 from protocol.scans import Checkerboard
 

@@ -18,7 +18,9 @@ from daemon.ring import Ring
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
 from daemon.separation.estimator import NotYet
-from drivers.base import CameraInfo, Frame, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo, Frame
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.scans import TwoImage
 
 SHAPE = (12, 16)

@@ -22,7 +22,9 @@ from daemon.separation.registration import (
     beyond,
     placed,
 )
-from drivers.base import CameraInfo, PixelFormat, StageInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.stage import StageInfo
 from protocol.mesh import Mesh as Holes
 from protocol.scans import Mesh
 

@@ -9,7 +9,7 @@ from daemon import report
 from daemon.frames import FrameRecord
 from daemon.separation.estimator import Observation
 from daemon.store import RunFile
-from protocol.messages import Product, RunState
+from protocol.messages.runs import Product, RunState
 from protocol.scans import AnyScan, Checkerboard, Mesh, Stick, TwoImage
 
 EVIL = """<script>alert("1")</script>'"&$id${note}"""

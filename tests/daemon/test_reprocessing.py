@@ -23,9 +23,14 @@ from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, Observation
 from daemon.store import RunFolder, Store
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo, StageInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
+from drivers.base.stage import StageInfo
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, Product, Progressed, Reprocess, RunState
+from protocol.messages.commands import Reprocess
+from protocol.messages.events import AnyEvent, Progressed
+from protocol.messages.runs import Product, RunState
 from protocol.scans import (
     AnyScan,
     CalibrateLeak,

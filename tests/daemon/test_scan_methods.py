@@ -10,7 +10,9 @@ import pytest
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Method, Taken, Unsuitable, Watch
 from daemon.separation.estimator import Lighting
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.patterns import BLACK, WHITE, Checker
 from protocol.scans import AnyScan, Checkerboard, Radiometry, Reference, Stick, TwoImage
 

@@ -13,7 +13,7 @@ from daemon.separation.estimator import Observation
 from daemon.store import DataFolderInUse, RunFolder, Store, estimate_bytes
 from drivers.clock import RealClock
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Product, RunState
+from protocol.messages.runs import End, Product, RunState
 from protocol.scans import Checkerboard, Stick, TwoImage
 
 

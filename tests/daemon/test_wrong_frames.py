@@ -20,7 +20,8 @@ from daemon.separation.estimator import Components, Lighting
 from daemon.separation.frameset import UNCHECKED, FrameSet
 from daemon.separation.radiometry import Response
 from daemon.separation.single import block_mean
-from drivers.base import CameraInfo, PixelFormat
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
 from protocol.patterns import Axis
 from protocol.scans import (
     Checkerboard,

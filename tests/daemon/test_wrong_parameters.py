@@ -14,7 +14,8 @@ from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Taken, Unsuitable
 from daemon.separation.estimator import Components, Lighting, Quality
 from daemon.separation.frameset import UNCHECKED
-from drivers.base import CameraInfo, PixelFormat
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
 from protocol.scans import (
     AnyScan,
     AnySeparation,

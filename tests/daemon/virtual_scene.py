@@ -16,7 +16,9 @@ from daemon import patterns
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Taken
 from daemon.separation.estimator import Components
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from drivers.virtual.geometry import Pinhole
 from drivers.virtual.scene import TARGET
 from drivers.virtual.transport import Transport, transport

@@ -12,7 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.devicethread import DeviceThread
-from drivers.base import Context, DeviceLost, DeviceRefused
+from drivers.base.device import Context
+from drivers.base.errors import DeviceLost, DeviceRefused
 from tests.drivers.xserver import screenshot, xvfb
 
 pygame = pytest.importorskip("pygame", reason="needs the extra: pip install 'umbra-rig[display]'")

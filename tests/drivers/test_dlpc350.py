@@ -16,15 +16,9 @@ from numpy.typing import NDArray
 
 from drivers import dlpc350, dlpc_hid, dmd
 from drivers import dlpc350_protocol as p
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    LoadedSequence,
-)
+from drivers.base.device import Context
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.projector import LoadedSequence
 from drivers.clock import NS, Clock
 from drivers.dlpc350 import Dlpc350Projector
 from drivers.registry import build

@@ -10,15 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Context,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    LoadedSequence,
-    Projector,
-)
+from drivers.base.camera import Acquisition, Frame
+from drivers.base.device import Context
+from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.projector import LoadedSequence, Projector
 from drivers.clock import NS, Clock, ScaledClock
 from drivers.registry import build
 from drivers.sequence import mismatch

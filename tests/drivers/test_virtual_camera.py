@@ -11,17 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    CameraSettings,
-    Context,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, CameraSettings, Frame
+from drivers.base.device import Context
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.pixelformat import PixelFormat
 from drivers.clock import NS, Clock, ScaledClock
 from drivers.registry import build
 from drivers.virtual.camera import VirtualCamera

@@ -11,13 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Context,
-    DeviceRefused,
-    DeviceTimeout,
-    StageState,
-)
+from drivers.base.camera import Acquisition
+from drivers.base.device import Context
+from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.stage import StageState
 from drivers.clock import NS, Clock, ScaledClock
 from drivers.registry import build
 from drivers.virtual.camera import VirtualCamera

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import umbra
 from protocol.errors import UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 
 READY_S = 60.0
 ANSWER_S = 30.0

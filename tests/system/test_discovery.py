@@ -12,14 +12,16 @@ import pytest
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import Health, Search
+from protocol.messages.findings import Search
+from protocol.messages.rig import Health
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system
 
 DRIVERS = """
 import os, threading
-from drivers.base import DeviceRefused, Options
+from drivers.base.errors import DeviceRefused
+from drivers.base.device import Options
 from drivers.virtual.camera import VirtualCamera
 
 class Needy(Options, frozen=True, kw_only=True):

@@ -10,7 +10,8 @@ import pytest
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import Check, Outcome, RigState
+from protocol.messages.findings import Check, Outcome
+from protocol.messages.rig import RigState
 from tests.system.harness import Daemon, recorded
 
 pytestmark = pytest.mark.system

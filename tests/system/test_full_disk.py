@@ -12,7 +12,8 @@ import pytest
 import umbra
 from daemon.frames import FrameStore
 from protocol.errors import Code, UmbraError
-from protocol.messages import RigState, RunState
+from protocol.messages.rig import RigState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system

@@ -12,9 +12,11 @@ from daemon.frames import FrameStore
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
 from daemon.separation.estimator import Components
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system

@@ -10,7 +10,8 @@ import zmq
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import Health, RigState, RunState
+from protocol.messages.rig import Health, RigState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system

@@ -14,7 +14,9 @@ import pytest
 import umbra
 from daemon.frames import FrameStore
 from protocol.errors import UmbraError
-from protocol.messages import RigState, RunState, Status
+from protocol.messages.replies import Status
+from protocol.messages.rig import RigState
+from protocol.messages.runs import RunState
 from protocol.run import Run
 from protocol.scans import Ready
 from tests.system.harness import Daemon, recorded, until

@@ -15,7 +15,7 @@ import pytest
 import umbra
 from daemon.frames import FrameStore
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until
 from tests.system.test_occluder import configured
 

@@ -7,7 +7,9 @@ import signal
 import pytest
 
 import umbra
-from protocol.messages import Logged, RigChanged, RigState, RunState
+from protocol.messages.events import Logged, RigChanged
+from protocol.messages.rig import RigState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system

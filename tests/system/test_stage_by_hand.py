@@ -11,7 +11,9 @@ import pytest
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import RigState, RunState, StageChanged, StageState
+from protocol.messages.events import StageChanged
+from protocol.messages.rig import RigState, StageState
+from protocol.messages.runs import RunState
 from tests.drivers.grbl_peer import GrblPeer
 from tests.system.harness import Daemon, recorded, until
 
