@@ -30,6 +30,8 @@ from drivers.track import Arc, Point, Track
 NEAR_MM = 0.05  # a target this near to the circle is on it
 POLL_S = 0.02
 STALL_S = 1.0  # a motor that was told to turn has begun by then
+
+
 CHIPS = {(0x2A3C, None)}
 """Trinamic's USB modules; one on RS485 shows its adapter only, and is not found."""
 

@@ -30,6 +30,8 @@ _STEP_ERRORS = 5.0
 _UNEQUAL = 0.05  # of a pair's light, from pair to pair
 _SAME = 0.35  # of the usual difference of two frames in a row: below it they are one pattern
 _MOST_NAMED = 5
+
+
 UNCHECKED = (
     "no black, white or ambient frame came with the patterns: light of the room counts as global, "
     "and black level, leakage and tone curve are taken as given, for little is there to check them "

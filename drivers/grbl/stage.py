@@ -30,6 +30,8 @@ from drivers.serialport import SerialPort, attached
 from drivers.track import Arc, Point
 
 ACCEPT_S = 2.0  # a first motion line is acknowledged within milliseconds
+
+
 CHIPS = {
     (0x2341, None), (0x2A03, None),  # Arduino
     (0x1A86, None),  # WCH: CH340, CH9102
