@@ -15,6 +15,7 @@ from daemon import __version__, discovery, measured, picture, products
 from daemon.byhand import ByHand
 from daemon.config import RigConfig
 from daemon.doctor.examination import Doctor
+from daemon.drawing import draw
 from daemon.logs import LogBook
 from daemon.manual import Manual
 from daemon.publisher import Publisher
@@ -104,6 +105,7 @@ class Commands:
             commands.GetProduct: self._product,
             commands.GetLog: self._log,
             commands.GetPreview: self._preview,
+            commands.Draw: self._draw,
             **self._by_hand.table,
         }
 
@@ -376,6 +378,13 @@ class Commands:
             )
 
         return await asyncio.to_thread(look)
+
+    async def _draw(self, command: commands.Draw, _: Asked) -> Answer:
+        drawn = await asyncio.to_thread(
+            draw, command.spec, command.image, command.width, command.height, command.gamma
+        )
+        facts = {"images": drawn.images, "lighting": drawn.lighting.value}
+        return Answer(replies.Picture(facts=facts), {"png": drawn.png})
 
     # ------------------------------------------------------------ events
 

@@ -242,6 +242,15 @@ class Commands:
         return Ask(commands.Show(pattern=pattern, lease_s=lease_s), message_of)
 
     @command
+    def draw(
+        self, spec: AnyScan, image: int, width: int, height: int, *, gamma: float = 1.0
+    ) -> Ask[Picture]:
+        """An image of a scan's patterns as the bytes of a PNG file: 0 is black, 1 white, then each
+        pattern; `facts["images"]` says how many there are."""
+        drawn = commands.Draw(spec=spec, image=image, width=width, height=height, gamma=gamma)
+        return Ask(drawn, picture_of("png"), SLOW_S)
+
+    @command
     def snap(self, *, png: bool = False, demosaic: bool = True) -> Ask[Picture]:
         """Take one frame as things are: native depth, a mosaic as it is; or the bytes of a PNG
         file, in colours unless `demosaic` is false."""

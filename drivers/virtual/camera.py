@@ -246,6 +246,7 @@ class VirtualCamera(VirtualDevice, Camera):
                 self._heard = pulse
                 start = pulse + round(self._o.trigger_latency_us * 1e3)
                 kinds = self.faults.strike("trigger", self._halted)
+                kinds |= self.faults.strike("pulse", self._halted)
                 missed = Fault.DROP_TRIGGER in kinds
                 if missed or start < self._free:
                     continue

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from daemon.scans import catalog
 from daemon.scans.method import Expose, Taken
-from daemon.separation.estimator import Components, Lighting
-from daemon.separation.frameset import UNCHECKED, FrameSet
+from daemon.separation.estimator import Components, Lighting, Quality
+from daemon.separation.finish import Judgement, bits, finish
+from daemon.separation.frameset import UNCHECKED, Ceiling, FrameSet
 from daemon.separation.radiometry import Response
 from daemon.separation.single import block_mean
 from protocol.patterns import Axis
@@ -313,3 +314,51 @@ def test_white_darker_than_the_patterns_and_black_brighter_are_told() -> None:
         pixels = rng.integers(level - 500, level + 500, (48, 64)).astype(np.uint16)
         frames.add(pixels, method.observe(step, Taken(index, 0, incomplete=False)))
     assert any("brighter than the white frame" in line for line in frames.told()[1])
+
+
+@pytest.mark.parametrize(
+    ("largest", "gain", "saturation", "words"),
+    [
+        (4095, 0.9, None, ("no sample is above", "--depth 12")),
+        (4095, 2.0, None, ("largest count of all, 4095", "--depth 12")),
+        (65520, 2.0, None, ("largest count of all, 65520", "--saturation 65520")),
+        (65520, 2.0, 65520.0, ()),
+        (4095, 2.0, 4095.0, ()),
+        (65535, 2.0, None, ()),
+        (65535, 0.9, None, ()),
+    ],
+)
+def test_a_scale_that_ends_below_16_bits_is_told(
+    largest: int, gain: float, saturation: float | None, words: tuple[str, ...]
+) -> None:
+    ceiling = Ceiling()
+    rng = np.random.default_rng(4)
+    for _ in range(3):
+        light = rng.normal(0.5, 0.12, (60, 80)).clip(0, 1) * gain
+        ceiling.add((light.clip(0, 1) * largest).astype(np.uint16))
+    told = ceiling.told(Response(65535, saturation=saturation))
+    assert len(told) == (1 if words else 0)
+    assert all(word in told[0] for word in words)
+
+
+@pytest.mark.parametrize(
+    ("limit", "edges", "words"),
+    [(30.0, False, "noise hides"), (3.0, True, "edges of the pattern"), (3.0, False, "in order")],
+)
+def test_what_most_pixels_lack_is_named(limit: float, edges: bool, words: str) -> None:
+    """Seven tenths of the pixels are lit, and have no direct light that is told from noise."""
+    light = np.full((20, 30), 100.0, dtype=np.float32)
+    lost = np.broadcast_to(np.arange(30) < 21, light.shape)
+    found = finish(
+        direct=np.where(lost, np.float32(0), np.float32(60)),
+        indirect=light.copy(),
+        response=Response(255),
+        brightest=light,
+        saturated=np.zeros(light.shape, dtype=np.bool_),
+        judgement=Judgement(*(np.full_like(light, x) for x in (limit, limit, limit / 3))),
+        flags=bits(lost, Quality.LOW_MODULATION) if edges else None,
+        facts={},
+    )
+    (line,) = found.facts["advice"]
+    assert "70.0% of the pixels that are lit at all cannot be separated" in line
+    assert words in line

@@ -16,6 +16,11 @@ from tests.system import warm
 
 READY_S = 60.0
 ANSWER_S = 30.0
+SLOW, FAST = 0.25, 20.0
+"""Time scales: for a run that must go on until something happens to it, however late that comes on
+a busy machine; and for one whose end is waited for."""
+
+ENDLESS = umbra.Checkerboard(average=500)
 
 FAST_RIG = """
 [rig]
