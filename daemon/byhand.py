@@ -26,7 +26,7 @@ from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
 from protocol.messages import commands, replies
 from protocol.messages.rig import CameraSettings
-from protocol.scans import Radiometry
+from protocol.scans.spec import Radiometry
 
 T = TypeVar("T")
 

@@ -15,16 +15,18 @@ from daemon import __version__, discovery, measured, picture, products
 from daemon.byhand import ByHand
 from daemon.config import RigConfig
 from daemon.doctor.examination import Doctor
+from daemon.drawing import draw
 from daemon.logs import LogBook
 from daemon.manual import Manual
 from daemon.publisher import Publisher
 from daemon.reprocessor import Reprocessor
 from daemon.rig import SAFE_S, Rig
+from daemon.runfolder import RunFolder
 from daemon.runner import Runner
 from daemon.scans import catalog
 from daemon.separation.estimator import Components, Result
 from daemon.server import Answer, Asked, Caller
-from daemon.store import RunFolder, Store
+from daemon.store import Store
 from daemon.viewfinder import Glimpse, Viewfinder, cells
 from protocol.errors import Code, UmbraError
 from protocol.messages import commands, replies
@@ -103,6 +105,7 @@ class Commands:
             commands.GetProduct: self._product,
             commands.GetLog: self._log,
             commands.GetPreview: self._preview,
+            commands.Draw: self._draw,
             **self._by_hand.table,
         }
 
@@ -375,6 +378,13 @@ class Commands:
             )
 
         return await asyncio.to_thread(look)
+
+    async def _draw(self, command: commands.Draw, _: Asked) -> Answer:
+        drawn = await asyncio.to_thread(
+            draw, command.spec, command.image, command.width, command.height, command.gamma
+        )
+        facts = {"images": drawn.images, "lighting": drawn.lighting.value}
+        return Answer(replies.Picture(facts=facts), {"png": drawn.png})
 
     # ------------------------------------------------------------ events
 

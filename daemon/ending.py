@@ -9,8 +9,8 @@ from typing import Any
 
 import structlog
 
+from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Result
-from daemon.store import RunFolder
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import End, RunState
 

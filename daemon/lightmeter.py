@@ -22,7 +22,9 @@ from daemon.snapshot import snap_whole
 from drivers.base.camera import CameraInfo, CameraSettings, Frame
 from drivers.clock import NS
 from protocol.patterns import WHITE
-from protocol.scans import CalibrateDark, OccluderScan, Spec
+from protocol.scans.calibrations import CalibrateDark
+from protocol.scans.occluded import OccluderScan
+from protocol.scans.spec import Spec
 
 _SHOW_S = 5.0
 _LIGHT_S = 5.0

@@ -36,7 +36,7 @@ from protocol.errors import Code, UmbraError
 from protocol.messages.events import AnyEvent
 from protocol.messages.rig import LockInfo
 from protocol.patterns import AnyPattern, Stripes
-from protocol.scans import SingleImage
+from protocol.scans.projected import SingleImage
 
 _OFF_S = 2.0
 _LIGHT_S = 600.0

@@ -26,7 +26,7 @@ from drivers.base.errors import DeviceError
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import Waiting
-from protocol.scans import Ready
+from protocol.scans.spec import Ready
 
 _MENDS = {
     Code.DEVICE_LOST,

@@ -38,7 +38,7 @@ from protocol.connection import (
 )
 from protocol.errors import Code, UmbraError
 from protocol.messages.replies import Welcome
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 
 T = TypeVar("T")
 log = logging.getLogger("umbra")

@@ -40,7 +40,9 @@ from protocol.results import (
     separation_of,
     stage_of,
 )
-from protocol.scans import AnyScan, SingleImage, Spec
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import SingleImage
+from protocol.scans.spec import Spec
 
 SLOW_S = 30.0
 """The least time-out of a command whose own work takes time: an exposure, a large array."""
@@ -238,6 +240,15 @@ class Commands:
                 )
             pattern = named
         return Ask(commands.Show(pattern=pattern, lease_s=lease_s), message_of)
+
+    @command
+    def draw(
+        self, spec: AnyScan, image: int, width: int, height: int, *, gamma: float = 1.0
+    ) -> Ask[Picture]:
+        """An image of a scan's patterns as the bytes of a PNG file: 0 is black, 1 white, then each
+        pattern; `facts["images"]` says how many there are."""
+        drawn = commands.Draw(spec=spec, image=image, width=width, height=height, gamma=gamma)
+        return Ask(drawn, picture_of("png"), SLOW_S)
 
     @command
     def snap(self, *, png: bool = False, demosaic: bool = True) -> Ask[Picture]:

@@ -17,7 +17,6 @@ from typing import Any, get_args
 import msgspec
 from msgspec import inspect as mi
 
-from protocol import patterns, scans
 from protocol.connection import ATTEMPTS, EVENTS_HWM, PREVIEWS_HWM
 from protocol.errors import Code, ErrorInfo
 from protocol.following import SILENCE_S
@@ -28,8 +27,11 @@ from protocol.messages.events import AnyEvent
 from protocol.messages.findings import Check, Found, Outcome, Search
 from protocol.messages.rig import CameraSettings, DeviceInfo, Health, LockInfo, RigState, StageState
 from protocol.messages.runs import End, Product, Progress, RunInfo, RunState, Waiting
-from protocol.patterns import AnyBinary, AnyPattern
-from protocol.scans import AnyScan, Point, Radiometry, Ready
+from protocol.patterns import AnyBinary, AnyPattern, Axis
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import Grid
+from protocol.scans.spec import Radiometry, Ready, Reference
+from protocol.scans.verifications import Point
 from protocol.wire import encode
 
 CLIENT = """\
@@ -155,6 +157,7 @@ _FACTS: tuple[Struct, ...] = (
     Point,
 )
 """What is in others and has no section of its own."""
+_CHOICES = (Reference, Grid, Axis)
 
 
 def _union(structs: list[mi.StructType]) -> str:
@@ -297,15 +300,6 @@ def _enum(cls: type[enum.StrEnum]) -> Iterator[str]:
     yield ""
 
 
-def _choices() -> Iterator[type[enum.StrEnum]]:
-    """The enums that scans and patterns are made of, in the sources' order."""
-    for module in (scans, patterns):
-        for cls in vars(module).values():
-            mine = isinstance(cls, type) and cls.__module__ == module.__name__
-            if mine and issubclass(cls, enum.StrEnum):
-                yield cls
-
-
 # ---------------------------------------------------------------- the page
 
 
@@ -409,7 +403,7 @@ their own {PREVIEWS_HWM} previews; they ask when they have heard nothing for {SI
     yield "## Facts\n\nParts of the above.\n"
     for fact in _FACTS:
         yield from _struct(fact)
-    for choices in _choices():
+    for choices in _CHOICES:
         yield from _enum(choices)
     yield "## Errors\n"
     yield from _struct(ErrorInfo)

@@ -20,7 +20,8 @@ from daemon.config import SequencerSection
 from daemon.scans.method import Bench, Unsuitable
 from drivers.base.camera import CameraInfo
 from drivers.base.projector import SequenceLimits
-from protocol.scans import PatternScan, Spec
+from protocol.scans.projected import PatternScan
+from protocol.scans.spec import Spec
 
 GUARDS = 2
 """A sequence begins with a white and a black image, by which its frames are known to be in step."""

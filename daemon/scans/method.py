@@ -19,7 +19,7 @@ from drivers.base.camera import CameraInfo
 from drivers.base.projector import ProjectorInfo
 from drivers.base.stage import StageInfo
 from protocol.patterns import AnyPattern
-from protocol.scans import Spec
+from protocol.scans.spec import Spec
 
 S = TypeVar("S", bound=Spec)
 

@@ -236,7 +236,7 @@ class _Pictures:
                 yield _seen(body, notice.arrays)
 
     def _renew(self) -> None:
-        from protocol.scans import SingleImage
+        from protocol.scans.projected import SingleImage
 
         try:
             self._client.live(self._rate_hz, LEASE_S, SingleImage() if self._separating else None)

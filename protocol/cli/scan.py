@@ -22,7 +22,8 @@ from protocol.cli.watch import conclude, follow, goes_on, tell
 from protocol.cli.words import Fetched
 from protocol.errors import Code, UmbraError
 from protocol.messages import replies
-from protocol.scans import Advise, AnyCalibration, AnyScan, AnySeparation, AnyVerification
+from protocol.scans.anyscan import AnyCalibration, AnyScan, AnySeparation, AnyVerification
+from protocol.scans.measuring import Advise
 
 if TYPE_CHECKING:
     from protocol.client import Client

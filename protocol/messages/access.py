@@ -5,8 +5,6 @@ from __future__ import annotations
 import enum
 
 DEFAULT_COMMAND = "tcp://127.0.0.1:5750"
-
-
 DEFAULT_EVENTS = "tcp://127.0.0.1:5751"
 
 

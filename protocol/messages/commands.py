@@ -10,7 +10,8 @@ from protocol.messages.access import Role
 from protocol.messages.rig import CameraSettings
 from protocol.messages.runs import RunState
 from protocol.patterns import AnyPattern
-from protocol.scans import AnyScan, SingleImage
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import SingleImage
 
 
 class Command(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):
@@ -202,6 +203,21 @@ class Show(Command, frozen=True, kw_only=True, tag="show"):
     lease_s: Annotated[float, Meta(gt=0, le=86_400)] = 600.0
 
 
+class Draw(Command, frozen=True, kw_only=True, tag="draw"):
+    """One image of a scan's patterns, to project it by other means. Array: `png` (uint8), 8-bit
+    grey. Of the projector that is attached nothing is used.
+
+    Image 0 is black, 1 is white, then comes each pattern once, in the scan's order; `facts` has
+    `images`, how many there are, and what this one is for (`lighting`).
+    """
+
+    spec: AnyScan
+    image: Annotated[int, Meta(ge=0)] = 0
+    width: Annotated[int, Meta(ge=1, le=16_384)]
+    height: Annotated[int, Meta(ge=1, le=16_384)]
+    gamma: Annotated[float, Meta(gt=0, le=10)] = 1.0  # light is level to this power: taken off
+
+
 class Snap(Command, frozen=True, kw_only=True, tag="snap"):
     """Take one frame as things are. Array: `frame`, native depth, or `png` (uint8) if asked."""
 
@@ -311,6 +327,6 @@ AnyCommand = (
     Hello | GetStatus | GetDevices | Discover | Examine | Submit | Reprocess | GetQueue
     | MoveQueued | Pause | Resume | Abort | EStop | Reset | ListRuns | GetRun | GetResult
     | GetProduct | GetLog | GetPreview | StartLive | StopLive
-    | Show | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove
+    | Show | Draw | Snap | SetCamera | SetLight | GetStage | StageHome | StageMove
     | StageCircle | StageStop | StageUnlock | Dark | Lock | RenewLock | Unlock
 )  # fmt: skip

@@ -12,6 +12,7 @@ from protocol.messages.commands import (
     Command,
     Dark,
     Discover,
+    Draw,
     EStop,
     Examine,
     GetDevices,
@@ -140,7 +141,8 @@ class Log(Reply, frozen=True, kw_only=True, tag="log"):
 
 
 class Picture(Reply, frozen=True, kw_only=True, tag="picture"):
-    """Answer to `preview` and `snap`. `facts`: exposure, saturated fraction, histogram, times."""
+    """Answer to `preview` and `snap`. `facts`: exposure, saturated fraction, histogram, times; to
+    `draw`: how many `images` there are, and the `lighting` of this one."""
 
     facts: dict[str, Any] = {}
 
@@ -206,6 +208,7 @@ ANSWERS: dict[type[Command], type[Reply]] = {
     StartLive: Done,
     StopLive: Done,
     Show: Done,
+    Draw: Picture,
     Snap: Picture,
     SetCamera: Camera,
     SetLight: Done,

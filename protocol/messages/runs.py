@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 
 
 class RunState(enum.StrEnum):

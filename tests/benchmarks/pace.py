@@ -28,7 +28,7 @@ from drivers import registry
 from drivers.base.camera import Acquisition, Camera, CameraSettings
 from drivers.base.device import Context
 from drivers.base.projector import Projector
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 from tests.benchmarks.bench import Running, daemon
 from tests.benchmarks.ratio import Ratio
 

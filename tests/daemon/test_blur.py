@@ -11,7 +11,8 @@ from daemon.separation import blur
 from daemon.separation.estimator import Components
 from daemon.separation.weave import Woven
 from protocol.patterns import Sinusoid as Wave
-from protocol.scans import Radiometry, Sinusoid
+from protocol.scans.projected import Sinusoid
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import Scene
 from tests.daemon.virtual_scene import VirtualScene
 

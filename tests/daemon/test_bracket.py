@@ -20,19 +20,18 @@ from daemon.separation.radiometry import FrameMean, Response
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
-from protocol.scans import (
-    AnySeparation,
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
     PatternScan,
-    Radiometry,
     RandomBinary,
     RandomPhase,
-    Reference,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry, Reference
 from tests.daemon.scene import OWN_US
 from tests.daemon.virtual_scene import BLACK, FULL, VirtualScene
 

@@ -9,7 +9,7 @@ from daemon.scans.method import Bench, Unsuitable
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
-from protocol.scans import TwoImage
+from protocol.scans.projected import TwoImage
 
 BENCH = Bench(
     CameraInfo(64, 48, PixelFormat.MONO12, exposure_range_us=(20.0, 1e6)),

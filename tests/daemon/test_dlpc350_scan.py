@@ -32,7 +32,7 @@ from drivers.virtual.scene import TARGET
 from drivers.virtual.timeline import Timeline
 from protocol.errors import Code
 from protocol.messages.runs import End, RunState
-from protocol.scans import Checkerboard, Sinusoid
+from protocol.scans.projected import Checkerboard, Sinusoid
 from tests.drivers.dlpc350_peer import Board, Usb
 
 SCAN = Checkerboard(checker=80, shift=30, shifts=5)

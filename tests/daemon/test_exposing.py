@@ -31,7 +31,8 @@ from daemon.sequencer import Sequencer, exposer_for
 from drivers.base.camera import CameraSettings
 from drivers.clock import NS, Clock
 from protocol.messages.runs import RunState
-from protocol.scans import Radiometry, TwoImage
+from protocol.scans.projected import TwoImage
+from protocol.scans.spec import Radiometry
 
 RIG = """
 [rig]

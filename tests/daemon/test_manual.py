@@ -16,7 +16,7 @@ from daemon.snapshot import snap
 from daemon.viewfinder import Viewfinder
 from drivers.base.camera import CameraSettings
 from protocol.patterns import WHITE
-from protocol.scans import Radiometry
+from protocol.scans.spec import Radiometry
 
 RIG = """
 [rig]

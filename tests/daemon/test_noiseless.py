@@ -15,7 +15,8 @@ from daemon.separation.estimator import Components
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
-from protocol.scans import AnyScan, Checkerboard, RandomBinary, TwoImage
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import Checkerboard, RandomBinary, TwoImage
 
 HEIGHT, WIDTH = 48, 64
 BENCH = Bench(

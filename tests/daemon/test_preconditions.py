@@ -15,7 +15,7 @@ from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import RunState, Waiting
-from protocol.scans import Ready
+from protocol.scans.spec import Ready
 
 
 class JumpingClock(Clock):

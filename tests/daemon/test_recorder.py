@@ -21,7 +21,7 @@ from daemon.separation.estimator import NotYet
 from drivers.base.camera import CameraInfo, Frame
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
-from protocol.scans import TwoImage
+from protocol.scans.projected import TwoImage
 
 SHAPE = (12, 16)
 CAMERA = CameraInfo(SHAPE[1], SHAPE[0], PixelFormat.MONO8)

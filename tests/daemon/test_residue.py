@@ -11,17 +11,17 @@ from daemon.separation.estimator import Components, Quality
 from daemon.separation.fineness import astray, finer_pattern
 from daemon.separation.straddling import as_neighbours
 from protocol.patterns import Axis
-from protocol.scans import (
-    AnySeparation,
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Radiometry,
     RandomBinary,
     RandomPhase,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import Scene
 from tests.daemon.virtual_scene import VirtualScene
 

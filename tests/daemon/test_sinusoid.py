@@ -14,7 +14,7 @@ from daemon.separation.estimator import Components, Lighting, NotYet, Observatio
 from daemon.separation.frameset import UNCHECKED
 from daemon.separation.radiometry import Response
 from daemon.separation.sinusoid import LeastSquares
-from protocol.scans import Sinusoid as Spec
+from protocol.scans.projected import Sinusoid as Spec
 from tests.daemon.scene import Scene
 
 FULL = 65535

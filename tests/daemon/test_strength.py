@@ -16,7 +16,7 @@ from daemon.separation.strength import SourceStrength
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.stage import StageInfo
-from protocol.scans import Mesh
+from protocol.scans.occluded import Mesh
 from tests.daemon.test_mesh import COVERING, DEEP, HEIGHT, MESH, WIDTH, circle, counts, errors
 
 TURN = 72

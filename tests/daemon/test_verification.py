@@ -17,8 +17,8 @@ from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
 from protocol.patterns import WHITE, Checker, Unlit
-from protocol.scans import (
-    AnyScan,
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.verifications import (
     Point,
     VerifyCheckerSize,
     VerifyLitFraction,

@@ -26,7 +26,7 @@ from protocol.messages.events import AnyEvent, RunChanged
 from protocol.messages.findings import Check, Search
 from protocol.messages.rig import RigState, StageState
 from protocol.messages.runs import End, Product, RunInfo, RunState
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 from protocol.wire import Arrays, decode, encode, headers
 
 T = TypeVar("T")
@@ -281,6 +281,9 @@ class FakeRig:
                 return reply, {"data": part}
             case commands.GetLog():
                 return replies.Log(records=({"event": "hello"},)), {}
+            case commands.Draw():
+                facts = {"images": 27, "lighting": "black"}
+                return replies.Picture(facts=facts), {"png": np.zeros(8, np.uint8)}
             case commands.GetPreview() | commands.Snap():
                 name = "preview" if isinstance(command, commands.GetPreview) else "frame"
                 return replies.Picture(facts={"saturated": 0}), {

@@ -25,7 +25,8 @@ from protocol.messages.events import Logged
 from protocol.messages.findings import Check, Outcome
 from protocol.messages.rig import CameraSettings, DeviceInfo, Health
 from protocol.messages.runs import End, Product, Progress, RunInfo, RunState
-from protocol.scans import Checkerboard, Radiometry, Reference, TwoImage
+from protocol.scans.projected import Checkerboard, TwoImage
+from protocol.scans.spec import Radiometry, Reference
 from tests.protocol.fake import FakeRig
 
 Captured = pytest.CaptureFixture[str]

@@ -25,7 +25,7 @@ from protocol.messages.events import PreviewTaken, Progressed, QueueChanged, Rig
 from protocol.messages.rig import RigState
 from protocol.messages.runs import End, Product, Progress, RunInfo, RunState
 from protocol.run import Run
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 from tests.protocol.fake import UTC, FakeRig
 
 NEVER_S = 1000.0

@@ -18,7 +18,7 @@ from protocol.messages import commands, replies
 from protocol.messages.envelopes import Request
 from protocol.messages.events import AnyEvent
 from protocol.messages.runs import RunState
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 from tests.protocol.fake import FakeRig
 
 DOCS = Path(__file__).parents[2] / "docs" / "protocol.md"

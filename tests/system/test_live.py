@@ -19,7 +19,7 @@ from protocol.errors import Code, UmbraError
 from protocol.messages.events import PreviewTaken, RigChanged
 from protocol.messages.rig import RigState
 from protocol.messages.runs import RunState
-from protocol.scans import SingleImage
+from protocol.scans.projected import SingleImage
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system

@@ -22,7 +22,7 @@ from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
 from drivers.registry import UnknownDriver, load
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 from tests.drivers import aravis_peer, gentl_peer
 from tests.system.harness import Daemon
 
