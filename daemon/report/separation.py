@@ -37,14 +37,8 @@ from protocol.scans.occluded import OccluderScan
 from protocol.scans.projected import PatternScan
 
 _ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a line of advice
-
-
 _DIM_BELOW = 0.25  # of full scale: a scene that uses less than this is under-exposed
-
-
 _MANY_LOST = 0.1  # of a video's frames
-
-
 _FOOTER = (
     "Pictures are for eyes: sRGB, all at one scale, clipped. The measurements are in the TIFF "
     "files: linear, float32, NaN where nothing was measured."

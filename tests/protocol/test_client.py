@@ -68,6 +68,7 @@ def test_each_command_has_a_method_and_the_answer_it_names(fake: FakeRig, rig: C
     assert bytes(rig.product_part(run.id, "direct", 1).data) == b"bc"
     assert rig.log() == ({"event": "hello"},)
     assert rig.preview().pixels.shape == rig.snap().pixels.shape == (4, 4, 3)
+    assert rig.draw(Checkerboard(), 0, 64, 48).facts["images"] == 27
     assert rig.camera(gain=2.0).gain == 2.0
     assert rig.stage() == rig.stage_home() == rig.stage_move(1, 2, 3) == STAGE
     assert rig.stage_circle((9, 9), 3, 2) == rig.stage_stop() == rig.stage_unlock() == STAGE
