@@ -7,9 +7,9 @@ import threading
 import msgspec
 import pytest
 
-from daemon.control import Control
-from daemon.devicethread import Revoked, Session
-from daemon.preconditions import LightWatch, Precondition, Preconditions
+from daemon.devices.devicethread import Revoked, Session
+from daemon.exposing.control import Control
+from daemon.runs.preconditions import LightWatch, Precondition, Preconditions
 from daemon.separation.metering import Level
 from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import NS, Clock

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from protocol.errors import UmbraError
 from protocol.messages.replies import Status
 from protocol.messages.rig import RigState
