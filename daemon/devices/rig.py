@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, cast
@@ -204,6 +205,15 @@ class Rig:
         if isinstance(error, DeviceLost) or member.thread.stuck:
             member.stale = member.pending
             self._set(member, Health.STUCK if member.thread.stuck else Health.LOST, str(error))
+
+    @contextlib.contextmanager
+    def noticing(self) -> Iterator[None]:
+        """What a device says meanwhile counts for its health: a lost one is connected again."""
+        try:
+            yield
+        except DeviceError as error:
+            self.failed(error)
+            raise
 
     def _connecting(self, member: _Member) -> Callable[[Device], None]:
         def connect(device: Device) -> None:

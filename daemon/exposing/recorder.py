@@ -18,9 +18,10 @@ import contextvars
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, TypeVar
 
@@ -57,6 +58,7 @@ class Exposed:
     missing: str = ""
     stage_mm: tuple[float, float] | None = None
     lit_ns: int = 0  # from when the light was said to be the step's; 0: not known
+    exposing: Mapping[str, int] = field(default_factory=dict)  # see `FrameRecord`
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +118,7 @@ class Recorder:
         self._taken_in = 0  # ... in the estimator
         self._changed = threading.Condition()
         self._concluding = threading.Lock()  # once the separator has ended anybody may ask
+        self._exposing: Counter[str] = Counter()
         self._missing_patterns: dict[int, str] = {}  # and why, last
         self._seen_patterns: set[int] = set()
         self._incoming: queue.Queue[Exposed | None] = queue.Queue(maxsize=ring.count + 1)
@@ -142,8 +145,10 @@ class Recorder:
         for record in self._frames.records():
             on_frame()
             position = (record.step, record.sub + 1)
+            self._exposing.update(record.exposing)
             if record.missing:
                 missing += 1
+                self._tally = Tally(recorded, missing, rejected)
                 self._missing_patterns[record.observation.pattern] = record.missing
                 continue
             scratch = self._frames.read(record.index, out=scratch)
@@ -152,7 +157,7 @@ class Recorder:
             self._note(record)
             recorded += 1
             rejected += not record.observation.used
-        self._tally = Tally(recorded, missing, rejected)
+            self._tally = Tally(recorded, missing, rejected)
         self._summary = self._estimator.summary()
         return position
 
@@ -192,6 +197,11 @@ class Recorder:
         """Patterns of which no frame could be had, and why."""
         missing = sorted(self._missing_patterns.items())
         return {pattern: why for pattern, why in missing if pattern not in self._seen_patterns}
+
+    @property
+    def exposing(self) -> Mapping[str, int]:
+        """The sum of what the records say of it."""
+        return dict(self._exposing)
 
     def finish(self) -> None:
         """Wait until everything is durable and taken in; the workers end. Raises their failure."""
@@ -310,14 +320,14 @@ class Recorder:
             stage_mm=exposed.stage_mm,
             observation=observation,
             missing=exposed.missing,
+            exposing=dict(exposed.exposing),
         )
         if frame is None:
             return self._frames.append_missing(record)
         return self._when_there_is_room(lambda: self._frames.append(frame.pixels, record))
 
     def _when_there_is_room(self, write: Callable[[], R]) -> R:
-        """Write; on a full disk again and again. Any other failure is raised, and so is a full disk
-        that was found out by an fsync: what it has dropped must be read back, and is not here."""
+        """Write; on a full disk again and again. Any other failure is raised."""
         while True:
             try:
                 return write()
@@ -329,7 +339,18 @@ class Recorder:
     def _commit(self, waiting: list[tuple[Exposed, FrameRecord]]) -> None:
         if not waiting:
             return
-        self._when_there_is_room(self._frames.commit)
+        again = False
+
+        def commit() -> None:
+            nonlocal again
+            if again:  # it may have been an fsync that found the disk full, and dropped them
+                for exposed, record in waiting:
+                    if exposed.frame is not None:
+                        self._frames.rewrite(exposed.frame.pixels, record)
+            again = True
+            self._frames.commit()
+
+        self._when_there_is_room(commit)
         for item in waiting:
             self._hand_over(item)
         waiting.clear()
@@ -340,6 +361,7 @@ class Recorder:
                 self._answer(item)
                 continue
             exposed, record = item
+            self._exposing.update(record.exposing)
             tally = self._tally
             if exposed.frame is None:
                 self._missing_patterns[record.observation.pattern] = record.missing

@@ -31,7 +31,6 @@ from daemon.separation.exposure import LONGEST_US
 from daemon.separation.metering import Exposure, Level, choose, level_of
 from daemon.separation.radiometry import Response
 from drivers.base.camera import Camera, CameraInfo, CameraSettings, Frame
-from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages.events import AnyEvent
 from protocol.messages.rig import LockInfo
@@ -67,7 +66,7 @@ class Manual:
     ) -> None:
         """`on_change` and `publish` must be safe to call from any thread."""
         self._rig = rig
-        self.stage = ManualStage(rig, self.use, self._keep, publish)
+        self.stage = ManualStage(rig, self.use, self._keep, self._lasting, publish)
         self.live = Live(rig, viewfinder, self.use)
         self._viewfinder = viewfinder
         self._on_change = on_change
@@ -201,6 +200,17 @@ class Manual:
     # ------------------------------------------------------------ acts
 
     @contextlib.contextmanager
+    def _lasting(self) -> Iterator[None]:
+        """Something that lasts as long as it lasts, whatever the lease."""
+        with self._mutex:
+            self._acts += 1
+        try:
+            yield
+        finally:
+            with self._mutex:
+                self._acts -= 1
+
+    @contextlib.contextmanager
     def _act(self) -> Iterator[Session]:
         """Something that is over when it is done: then the rig is as safe as before, unless another
         act is under way or somebody wants manual work to go on. Raises UmbraError(busy)."""
@@ -212,7 +222,7 @@ class Manual:
             assert session is not None
             self._acts += 1
         try:
-            with self._noticed():
+            with self._rig.noticing():
                 yield session
         finally:
             with self._mutex:
@@ -222,15 +232,6 @@ class Manual:
             if over:
                 self._rig.safe_within(futures, SAFE_S)
                 self._on_change()
-
-    @contextlib.contextmanager
-    def _noticed(self) -> Iterator[None]:
-        """What a device says meanwhile counts for its health: a lost one is connected again."""
-        try:
-            yield
-        except DeviceError as error:
-            self._rig.failed(error)
-            raise
 
     def show(self, pattern: AnyPattern, lease_s: float) -> None:
         """Show a pattern until the lease is over. Raises UmbraError, DeviceError."""
@@ -244,7 +245,7 @@ class Manual:
             session = self.use(lease_s)
         info = projector.device.info()
         image = render(pattern, info.width, info.height)
-        with self._noticed():
+        with self._rig.noticing():
             projector.call(lambda p: p.show(image), SHOW_S, session)
 
     def look(
@@ -269,7 +270,7 @@ class Manual:
             known = ", ".join(self._rig.lights) or "none"
             raise UmbraError(Code.DEVICE_MISSING, f"no light {name!r}: this rig has {known}")
         session = self.use(_LIGHT_S if on else _OFF_S)
-        with self._noticed():
+        with self._rig.noticing():
             thread.call(lambda light: light.set(on), CALL_S, session)
 
     def snap(self) -> tuple[Frame, CameraInfo]:

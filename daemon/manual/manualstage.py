@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from concurrent.futures import TimeoutError as FutureTimeout
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
 import structlog
@@ -74,12 +75,15 @@ class ManualStage:
         rig: Rig,
         use: Callable[[float], Session],
         keep: Callable[[Session, float], None],
+        lasting: Callable[[], AbstractContextManager[None]],
         publish: Callable[[AnyEvent], None],
     ) -> None:
-        """`use` begins or joins manual work, `keep` prolongs it; `publish` from any thread."""
+        """`use` begins or joins manual work, `keep` prolongs it, within `lasting` no lease ends
+        it; `publish` from any thread."""
         self._rig = rig
         self._use = use
         self._keep = keep
+        self._lasting = lasting
         self._publish = publish
         self._mutex = threading.Lock()  # one asks for a motion at a time; stop waits for nobody
         self._motion: _Motion | None = None  # the last
@@ -112,8 +116,9 @@ class ManualStage:
         if self._homing is not None:  # its thread waits, and the controller is silent
             return self._as_reply(StageState.HOMING, None, "")
         try:
-            # not `call`: a question that comes too late must not halt a scan's motion
-            now = thread.submit(lambda s: s.status(), _ASK_S).result(_ASK_S)
+            with self._rig.noticing():
+                # not `call`: a question that comes too late must not halt a scan's motion
+                now = thread.submit(lambda s: s.status(), _ASK_S).result(_ASK_S)
         except FutureTimeout:
             raise UmbraError(
                 Code.DEVICE_TIMEOUT, f"{thread.device.name}: status: it is busy; ask again"
@@ -151,10 +156,9 @@ class ManualStage:
 
     def stop(self) -> StageStatus:
         """End every motion, homing too. Raises UmbraError, DeviceError."""
-        thread = self._thread
         session = self._use(_LEASE_S)
         self._end_homing()
-        thread.call(lambda s: s.stop(), CALL_S, session)
+        self._call(lambda s: s.stop(), session)
         if self._motion is not None:
             self._motion.join(CALL_S)
         return self.status()
@@ -163,7 +167,7 @@ class ManualStage:
         """Leave the alarm; the position stays unknown. Raises UmbraError, DeviceError."""
         self._require_not_homing()
         self._problem = ""
-        self._thread.call(lambda s: s.unlock(), CALL_S, self._use(_LEASE_S))
+        self._call(lambda s: s.unlock(), self._use(_LEASE_S))
         return self.status()
 
     def finish(self) -> None:
@@ -175,6 +179,11 @@ class ManualStage:
             self.stop()
 
     # ------------------------------------------------------------ the motion
+
+    def _call(self, act: Callable[[Stage], None], session: Session) -> None:
+        """Make a call of manual work, which does not end meanwhile. Raises DeviceError, Revoked."""
+        with self._lasting(), self._rig.noticing():
+            self._thread.call(act, CALL_S, session)
 
     def _require_not_homing(self) -> None:
         if self._homing is not None:
@@ -197,10 +206,9 @@ class ManualStage:
             wait([homing], _HALT_EVERY_S)
 
     def _go(self, act: Callable[[Stage], None], *, endless: bool) -> StageStatus:
-        thread = self._thread
         with self._mutex:
             self._require_not_homing()
-            session = self._use(ENDLESS_S if endless else _LEASE_S)
+            session = self._use(_LEASE_S)
             self._take_over()
 
             def go(stage: Stage) -> None:
@@ -211,7 +219,7 @@ class ManualStage:
 
             self._problem = ""
             try:
-                thread.call(go, CALL_S, session)
+                self._call(go, session)
             finally:  # refused or not, what moves is followed until it rests
                 self._follow(_Motion(session, endless=endless), 0.0)
         return self.status()
@@ -248,12 +256,12 @@ class ManualStage:
             wait([homing], _LEASE_S / 2)
 
     def _pump(self, thread: DeviceThread[Stage], motion: _Motion) -> None:
-        session, tell_at = motion.session, 0.0
+        session, tell_at, since = motion.session, 0.0, time.monotonic()
         while not motion.replaced.is_set():
             now: DriverStatus = thread.call(lambda s: s.pump(), CALL_S, session)
             if now.state is not DriverState.MOVING:
                 return
-            if not motion.endless:
+            if not motion.endless or time.monotonic() < since + ENDLESS_S:
                 self._keep(session, _LEASE_S)
             if time.monotonic() >= tell_at:
                 tell_at = time.monotonic() + _TELL_S

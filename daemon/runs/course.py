@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any
@@ -84,7 +83,6 @@ class Course:
         self._recorder: Recorder | None = None
         self._room = Room(store, self.control)
         self._timings: dict[str, float] = {}
-        self._exposed: Counter[str] = Counter()  # see `Choice.facts`
         self._reason = ""  # why the steps ended
         self._broke_off = ""  # when an interrupted run took its last frame
 
@@ -155,7 +153,7 @@ class Course:
         bench, exposure = prepared.bench, prepared.exposure
         info = bench.camera
         exposure_us = float(prepared.settings.get("exposure_us", 0.0))
-        choice = self._choose(bench, exposure_us, resuming)
+        choice = self._choose(bench, exposure_us)
         longest = 1.0
         if isinstance(file.spec, PatternScan) and file.spec.bracket is not None:
             longest = max(file.spec.bracket)
@@ -174,7 +172,7 @@ class Course:
             rig=rig,
             bench=bench.recorded(),
             calibration=prepared.calibration,
-            sequencing=choice.facts(self._exposed),
+            sequencing=choice.facts(file.sequencing["counts"] if file.sequencing else {}),
         )
         if prepared.waited_s:
             self._timings["waited_s"] = prepared.waited_s
@@ -200,7 +198,7 @@ class Course:
                 try:
                     recorder.finish()
                 finally:
-                    self._count(recorder.tally, choice)
+                    self._count(recorder, choice)
             self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
             truth = self._truth(session, _sources(file.spec, bench))
             self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
@@ -239,8 +237,6 @@ class Course:
                 f"{self._config.rig.data}: the disk has not taken a frame for half a minute; "
                 "check it, then `umbra resume`",
             ) from error
-        finally:
-            self._exposed.update(apparatus.counts)
 
     def _truth(self, session: Session, sources: tuple[str, ...]) -> dict[str, Any]:
         """What a simulated camera knows; a scan does not fail for the lack of it."""
@@ -252,12 +248,9 @@ class Course:
 
     # ------------------------------------------------------------ before
 
-    def _choose(self, bench: Bench, exposure_us: float, resuming: bool) -> Choice:
+    def _choose(self, bench: Bench, exposure_us: float) -> Choice:
         """How exposures are kept in step with patterns. Raises Unsuitable."""
-        file = self.folder.file
-        if resuming and file.sequencing is not None:
-            self._exposed.update(file.sequencing["counts"])
-        choice = choose(file.spec, self._config.sequencer, bench, exposure_us)
+        choice = choose(self.folder.file.spec, self._config.sequencer, bench, exposure_us)
         log.info("mode", mode=choice.mode, why=choice.why)
         for warning in choice.warnings:
             log.warning("exposure", problem=warning)
@@ -363,12 +356,13 @@ class Course:
             self._viewfinder.offer(exposed.frame, self._rig.camera.device.info(), self.folder.id)
         self.standing.taken(tally)
 
-    def _count(self, tally: Tally, choice: Choice) -> None:
+    def _count(self, recorder: Recorder, choice: Choice) -> None:
+        tally = recorder.tally
         self.standing.note(
             recorded=tally.recorded,
             missing=tally.missing,
             rejected=tally.rejected,
-            sequencing=choice.facts(self._exposed),
+            sequencing=choice.facts(recorder.exposing),
         )
 
     # ------------------------------------------------------------ after

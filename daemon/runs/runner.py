@@ -89,13 +89,14 @@ class Runner:
             if run.file.state in _UNFINISHED:
                 reason = "umbrad ended while the run was under way; `umbra resume` goes on with it"
                 end = End(state=RunState.INTERRUPTED, reason=reason)
-                recorded, missing = count(run.path)
+                found, how = count(run.path), run.file.sequencing
                 run.remember(
                     state=RunState.INTERRUPTED,
                     ended=utc_now(),
                     end=end,
-                    recorded=recorded,
-                    missing=missing,
+                    recorded=found.recorded,
+                    missing=found.missing,
+                    sequencing=how and {**how, "counts": found.exposing},
                 )
                 log.warning("run interrupted", run=run.id)
         self.tend()

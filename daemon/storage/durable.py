@@ -16,7 +16,7 @@ from pathlib import Path
 
 from protocol.errors import Code, UmbraError
 
-_FULL = {errno.ENOSPC, errno.EDQUOT}
+FULL = {errno.ENOSPC, errno.EDQUOT}
 _REMEDIES = {
     errno.EACCES: "let the daemon's user write there, or give it another data folder",
     errno.EPERM: "let the daemon's user write there, or give it another data folder",
@@ -47,7 +47,7 @@ def storage(phase: str) -> Iterator[None]:
         yield
     except OSError as error:
         place = f" ({error.filename})" if error.filename else ""
-        if error.errno in _FULL:
+        if error.errno in FULL:
             raise StorageError(
                 Code.STORAGE_FULL, f"{phase}: the disk is full{place}; delete old runs, then resume"
             ) from error

@@ -15,6 +15,9 @@ import re
 import shutil
 import zlib
 from array import array
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +27,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from daemon.separation.estimator import Observation
 from daemon.storage import journal
-from daemon.storage.durable import Damaged, atomic_write, fsync_file, fsync_folder, storage
+from daemon.storage.durable import FULL, Damaged, atomic_write, fsync_file, fsync_folder, storage
 from daemon.storage.journal import Journal
 from daemon.storage.shards import Layout
 from protocol.errors import Code, UmbraError
@@ -41,6 +44,8 @@ class FrameRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     `index` is the frame's place in the run and in the array. `start_ns` and `end_ns` bound the
     exposure on the rig's monotonic clock, `utc` is its start (ISO 8601), `stage_mm` the position
     at its middle. `checksum` is the CRC-32 of the pixels (C order, little endian), in hex.
+    `exposing` counts what came since the record before: frames by the way in which they were
+    exposed, exposures `repeated`, frames of a stream that were `passed` over.
     """
 
     index: int
@@ -58,6 +63,7 @@ class FrameRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     observation: Observation
     checksum: str = ""
     missing: str = ""
+    exposing: dict[str, int] = {}
 
 
 class NoPixels(UmbraError):
@@ -70,9 +76,10 @@ class NoPixels(UmbraError):
 class FrameStore:
     """The frames of one run. One thread appends and commits; `read` may be called from any.
 
-    Memory is 8 bytes a frame. On a full disk `append` and `commit` may be repeated when there is
-    room. After a failed fsync the store is closed, and nothing more is acknowledged until it has
-    been opened again.
+    Memory is 8 bytes a frame. On a full disk `append` may be repeated when there is room, and
+    `commit` after a `rewrite` of what it was to make durable: a full disk may show at an fsync
+    only, which has then dropped what was written. After any other failed fsync the store is
+    closed, and nothing more is acknowledged until it has been opened again.
     """
 
     def __init__(self, folder: Path, layout: Layout | None, lines: Journal | None) -> None:
@@ -140,12 +147,15 @@ class FrameStore:
         checksum = zlib.crc32(flat.data)
         if self._layout:
             self._layout.check(pixels)
-            path = self._shard(record.index)
-            with storage(f"recording frame {record.index}"):
-                _write(path, [flat.data, self._layout.tail])
+            self._write(self._layout, data, record)
         record = msgspec.structs.replace(record, checksum=f"{checksum:08x}", missing="")
         self._add(record, checksum)
         return record
+
+    def rewrite(self, pixels: NDArray[Any], record: FrameRecord) -> None:
+        """Write a frame again that `append` took and no `commit` has made durable. StorageError."""
+        if self._layout and any(pending.index == record.index for pending in self._pending):
+            self._write(self._layout, np.ascontiguousarray(pixels, self._layout.dtype), record)
 
     def append_missing(self, record: FrameRecord) -> FrameRecord:
         """Record that a frame is missing, and why (`record.missing`)."""
@@ -179,7 +189,7 @@ class FrameStore:
 
     @property
     def writable(self) -> bool:
-        """Whether `append` and `commit` may be repeated: no fsync has failed."""
+        """Whether `append` and `commit` may be repeated: no fsync failed but for want of room."""
         return self._lines is not None and self._lines.writable
 
     # ------------------------------------------------------------ reading
@@ -251,6 +261,10 @@ class FrameStore:
         self._checksums.append(checksum)
         self._pending.append(record)
 
+    def _write(self, layout: Layout, data: NDArray[Any], record: FrameRecord) -> None:
+        with storage(f"recording frame {record.index}"):
+            _write(self._shard(record.index), [data.reshape(-1).view(np.uint8).data, layout.tail])
+
     def _shard(self, index: int) -> Path:
         return self.folder / ARRAY / f"c.{index}{self._layout.suffix if self._layout else ''}"
 
@@ -260,8 +274,9 @@ class FrameStore:
                 with storage(f"recording frame {record.index}"):
                     try:
                         fsync_file(self._shard(record.index))
-                    except OSError:
-                        self.close()  # its pages may be gone: a second fsync would lie
+                    except OSError as error:
+                        if error.errno not in FULL:
+                            self.close()  # its pages may be gone: a second fsync would lie
                         raise
         with storage("recording frames.zarr"):  # fsyncs the folder too, with the shards' names
             atomic_write(self.folder / ARRAY / "zarr.json", layout.metadata(len(self)))
@@ -304,12 +319,24 @@ def _write(path: Path, parts: list[memoryview | bytes]) -> None:
         raise
 
 
-def count(folder: Path) -> tuple[int, int]:
-    """Frames recorded and missing in a run's folder, for what a crash left; (0, 0) if there are
-    none yet, or unreadable: `FrameStore.open` says what is wrong."""
+@dataclass(frozen=True, slots=True)
+class Count:
+    """What a run's folder holds; `exposing` is the sum of the records'."""
+
+    recorded: int = 0
+    missing: int = 0
+    exposing: Mapping[str, int] = field(default_factory=dict)
+
+
+def count(folder: Path) -> Count:
+    """What is in a run's folder, for what a crash left; nothing if there are no frames yet, or
+    they are unreadable: `FrameStore.open` says what is wrong."""
     try:
         records = journal.read(folder / LINES, FrameRecord)
     except UmbraError:
-        return 0, 0
+        return Count()
     missing = sum(bool(record.missing) for record in records)
-    return len(records) - missing, missing
+    exposing: Counter[str] = Counter()
+    for record in records:
+        exposing.update(record.exposing)
+    return Count(len(records) - missing, missing, dict(exposing))

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from daemon.storage.durable import Damaged, fsync_folder, storage
+from daemon.storage.durable import FULL, Damaged, fsync_folder, storage
 
 T = TypeVar("T")
 
@@ -22,8 +22,9 @@ class Journal:
     """Appends records to a file; one writer, one thread. Opening drops a torn end.
 
     A commit that found the disk full has taken nothing back from its caller: the records stay in
-    the buffer and the file is as before, so that it can be repeated when there is room. After any
-    other failure nothing is known of the file until it has been opened again.
+    the buffer and the file is as before, so that it can be repeated when there is room; so it is
+    where only the fsync found it out, for all that it may have dropped is written again. After
+    any other failure nothing is known of the file until it has been opened again.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,8 +58,11 @@ class Journal:
                 raise
             try:
                 os.fsync(self._file)
-            except OSError:
-                self.close()
+            except OSError as error:
+                if error.errno in FULL:
+                    os.ftruncate(self._file, self._size)
+                else:
+                    self.close()
                 raise
         self._size += len(self._pending)
         self._pending.clear()
