@@ -1,15 +1,14 @@
-"""What each command does. One method a command; the protocol says what it means."""
+"""What each command does. One method a command; the protocol says what it means.
+
+Work by hand is in `byhand`, what only reads in `reading`; here is what drives the rig.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import itertools
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any
-
-import msgspec
-import numpy as np
 
 from daemon import __version__
 from daemon.config import RigConfig
@@ -18,16 +17,13 @@ from daemon.devices.rig import SAFE_S, Rig
 from daemon.doctor.examination import Doctor
 from daemon.logs import LogBook
 from daemon.manual.manual import Manual
-from daemon.pictures import picture
-from daemon.pictures.viewfinder import Glimpse, Viewfinder, cells
-from daemon.products import measured, separated
+from daemon.pictures.viewfinder import Viewfinder
 from daemon.runs.reprocessor import Reprocessor
 from daemon.runs.runner import Runner
 from daemon.scans import catalog
-from daemon.scans.drawing import draw
-from daemon.separation.estimator import Components, Result
 from daemon.serving.byhand import ByHand
 from daemon.serving.publisher import Publisher
+from daemon.serving.reading import Reading
 from daemon.serving.server import Answer, Asked, Caller
 from daemon.storage.runfolder import RunFolder
 from daemon.storage.store import Store
@@ -37,7 +33,7 @@ from protocol.messages.access import Role
 from protocol.messages.envelopes import PROTOCOL
 from protocol.messages.events import RigChanged
 from protocol.messages.rig import RigState
-from protocol.messages.runs import RunInfo, RunState
+from protocol.messages.runs import RunState
 
 ESTOP = "estop"
 """An emergency stop: the reason to hold the queue, and its mark in the data folder."""
@@ -67,10 +63,8 @@ class Commands:
         self._manual = manual
         self._store = store
         self._config = config
-        self._viewfinder = viewfinder
         self._doctor = doctor
         self._publisher = publisher
-        self._book = book
         self._epoch = epoch
         self._began = time.monotonic()
         self._estopped = store.marked(ESTOP)
@@ -85,7 +79,14 @@ class Commands:
             config=config,
             estopped=lambda: self._estopped,
         )
-        self._results = asyncio.Semaphore(1)  # one at a time: each takes the estimator's thread
+        self._reading = Reading(
+            runner=runner,
+            reprocessor=reprocessor,
+            manual=manual,
+            store=store,
+            viewfinder=viewfinder,
+            book=book,
+        )
         self.stopping = False
         self._table: dict[type[commands.Command], Callable[[Any, Asked], Awaitable[Answer]]] = {
             commands.Hello: self._hello,
@@ -102,14 +103,8 @@ class Commands:
             commands.Abort: self._abort,
             commands.EStop: self._estop,
             commands.Reset: self._reset,
-            commands.ListRuns: self._runs,
-            commands.GetRun: self._run,
-            commands.GetResult: self._result,
-            commands.GetProduct: self._product,
-            commands.GetLog: self._log,
-            commands.GetPreview: self._preview,
-            commands.Draw: self._draw,
             **self._by_hand.table,
+            **self._reading.table,
         }
 
     async def handle(
@@ -165,7 +160,7 @@ class Commands:
                 epoch=self._epoch,
                 uptime_s=time.monotonic() - self._began,
                 devices=self._rig.devices(),
-                run=self._counted(current) if current else None,
+                run=self._reading.counted(current) if current else None,
                 progress=self._runner.progress,
                 queue=tuple(run.info() for run in self._runner.queue()),
                 lock=self._manual.lock_info(),
@@ -175,19 +170,6 @@ class Commands:
                 reprocessing=self._reprocessor.progress,
             )
         )
-
-    def _counted(self, run: RunFolder) -> RunInfo:
-        """A run as it is now; its counts are written at its end only, so they are asked for."""
-        info = run.info()
-        for progress in (self._runner.progress, self._reprocessor.progress):
-            if progress is not None and progress.run == run.id:
-                info = msgspec.structs.replace(
-                    info,
-                    recorded=progress.recorded,
-                    missing=progress.missing,
-                    rejected=progress.rejected,
-                )
-        return info
 
     async def _devices(self, _: commands.GetDevices, __: Asked) -> Answer:
         return Answer(replies.Devices(devices=self._rig.devices()))
@@ -209,12 +191,6 @@ class Commands:
         if not command.passive:
             checks += await self._by_hand.do(asked, doctor.expose)
         return Answer(replies.Examined(checks=tuple(checks)))
-
-    async def _log(self, command: commands.GetLog, _: Asked) -> Answer:
-        if command.run:
-            await asyncio.to_thread(self._store.open, command.run)  # a name that is wrong is said
-        records = await asyncio.to_thread(self._book.records, command.run, command.limit)
-        return Answer(replies.Log(records=records))
 
     # ------------------------------------------------------------ runs
 
@@ -303,92 +279,6 @@ class Commands:
         self.changed("reset")
         return Answer(replies.Done(message="the queue goes on"))
 
-    async def _runs(self, command: commands.ListRuns, _: Asked) -> Answer:
-        def listed() -> tuple[RunInfo, ...]:
-            runs = self._store.runs()
-            chosen = (r for r in runs if command.state is None or r.file.state is command.state)
-            return tuple(self._counted(run) for run in itertools.islice(chosen, command.limit))
-
-        return Answer(replies.Runs(runs=await asyncio.to_thread(listed)))
-
-    async def _run(self, command: commands.GetRun, _: Asked) -> Answer:
-        run = await asyncio.to_thread(self._runner.find, command.run)
-        return Answer(replies.Run(run=self._counted(run)))
-
-    async def _result(self, command: commands.GetResult, _: Asked) -> Answer:
-        def result() -> Answer:
-            run = self._runner.find(command.run)
-            found, facts = self._result_of(run)
-            reply = replies.Result(
-                run=run.info(), final=run.file.state is RunState.DONE, facts=facts
-            )
-            if not isinstance(found, Components):
-                return Answer(reply)
-            return Answer(
-                reply,
-                {"direct": found.direct, "global": found.global_, "quality": found.quality},
-            )
-
-        async with self._results:
-            return await asyncio.to_thread(result)
-
-    def _result_of(self, run: RunFolder) -> tuple[Result, dict[str, Any]]:
-        """Of a run under way: so far; of one that has ended: as its products have it."""
-        for course in (self._runner.course, self._reprocessor.current):
-            if course is not None and course.folder.id == run.id and not run.file.products:
-                found = course.result()
-                return found, found.facts
-        measurement = measured.read(run)
-        return (measurement, measurement.facts) if measurement else separated.read(run)
-
-    async def _product(self, command: commands.GetProduct, _: Asked) -> Answer:
-        def part() -> Answer:
-            run = self._store.open(command.run)
-            path = run.product(command.name)
-            size = path.stat().st_size
-            with path.open("rb") as file:
-                file.seek(command.offset)
-                data = np.frombuffer(file.read(command.limit), np.uint8)
-            product = next(p for p in run.file.products if p.name == command.name)
-            return Answer(
-                replies.ProductPart(product=product, offset=command.offset, size=size),
-                {"data": data},
-            )
-
-        return await asyncio.to_thread(part)
-
-    async def _preview(self, command: commands.GetPreview, _: Asked) -> Answer:
-        def look() -> Answer:
-            if command.what == "frame":
-                glimpse = self._viewfinder.latest()
-                if glimpse is None:
-                    raise UmbraError(
-                        Code.NO_RESULT, "no frame has been taken yet; `umbra snap` takes one"
-                    )
-                return _looked(glimpse, command.width)
-            if self._manual.live.separating and (seen := self._viewfinder.latest(command.what)):
-                return _looked(seen, command.width)
-            run = self._runner.find("")
-            components, _ = self._result_of(run)
-            if not isinstance(components, Components):
-                raise UmbraError(
-                    Code.NO_RESULT, f"{run.id} measures: it has figures, no {command.what}"
-                )
-            plane = components.direct if command.what == "direct" else components.global_
-            shown = picture.component(plane, command.width)
-            return Answer(
-                replies.Picture(facts={"run": run.id, "what": command.what}), {"preview": shown}
-            )
-
-        return await asyncio.to_thread(look)
-
-    async def _draw(self, command: commands.Draw, _: Asked) -> Answer:
-        drawn = await asyncio.to_thread(
-            draw, command.spec, command.image, command.width, command.height, command.gamma
-        )
-        facts = {"images": drawn.images, "lighting": drawn.lighting.value}
-        return Answer(replies.Picture(facts=facts), {"png": drawn.png})
-
     # ------------------------------------------------------------ events
 
     def changed(self, reason: str = "") -> None:
@@ -396,15 +286,6 @@ class Commands:
         self._publisher.publish(
             RigChanged(state=self.state, lock=self._manual.lock_info(), reason=reason)
         )
-
-
-def _looked(glimpse: Glimpse, width: int) -> Answer:
-    small = picture.narrowed(glimpse.picture, width)
-    arrays = {"preview": small, "saturated": cells(glimpse.saturated, *small.shape[:2])}
-    age_s = round(time.monotonic() - glimpse.at_s, 1)
-    return Answer(
-        replies.Picture(facts={**glimpse.facts, "run": glimpse.run, "age_s": age_s}), arrays
-    )
 
 
 def _about(run: RunFolder) -> Answer:
