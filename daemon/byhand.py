@@ -183,7 +183,14 @@ class ByHand:
         return Answer(await asyncio.to_thread(self._manual.stage.stop))
 
     async def _stage_unlock(self, _: m.StageUnlock, asked: Asked) -> Answer:
-        return Answer(await self.do(asked, self._manual.stage.unlock))
+        """Also for a run that waits for just this: it has the devices, and homes the stage."""
+        current = self._runner.current
+        if current is None or current.file.state not in {m.RunState.QUEUED, m.RunState.WAITING}:
+            return Answer(await self.do(asked, self._manual.stage.unlock))
+        self._manual.admit(asked.token)
+        status = await asyncio.to_thread(self._manual.stage.unlock_for_run)
+        self._runner.wake()
+        return Answer(status)
 
     async def _dark(self, _: m.Dark, asked: Asked) -> Answer:
         await self.do(asked, self._manual.end)

@@ -22,7 +22,7 @@ from daemon.config import RigConfig
 from daemon.control import Control
 from daemon.devicethread import Revoked, Session
 from daemon.durable import StorageError
-from daemon.ending import close, end_of, of_lost, utc_now, with_exposure
+from daemon.ending import close, end_of, of_lost, requeue, utc_now, with_exposure
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.exposer import Behind
 from daemon.exposing.modes import Choice, Mode, choose
@@ -135,7 +135,11 @@ class Course:
                 self._rig.safe_within(futures, SAFE_S)
                 preparation.restore()
                 self._rig.leave(session)
-        close(self.folder, end, self._timings)
+        begun = self.folder.file.state not in {RunState.QUEUED, RunState.WAITING}
+        if end is self.control.verdict and end.state is RunState.INTERRUPTED and not begun:
+            requeue(self.folder)
+        else:
+            close(self.folder, end, self._timings)
         self.standing.changed()
         return end
 
@@ -188,6 +192,7 @@ class Course:
             except BaseException:
                 # Now, for the recorder may wait long for room.
                 self._rig.make_safe(halt=not session.ended.is_set())
+                recorder.hurry()
                 raise
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.
