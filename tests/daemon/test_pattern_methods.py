@@ -100,9 +100,7 @@ def test_the_newest_image_of_a_stream_is_the_result() -> None:
     brighter = iter([0.5, 0.7, 0.9])
     scene = Scene(change=lambda light, _: light * next(brighter))
     found = scene.scan(SingleImage(repeat=3, references=()))
-    still = Scene(change=lambda light, _: light * 0.9).scan(
-        SingleImage(repeat=1, references=())
-    )
+    still = Scene(change=lambda light, _: light * 0.9).scan(SingleImage(repeat=1, references=()))
     np.testing.assert_allclose(found.direct, still.direct, rtol=1e-3)
     assert found.facts["images"] == 3
 
