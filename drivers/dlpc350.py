@@ -32,18 +32,9 @@ from numpy.typing import NDArray
 
 from drivers import dlpc350_protocol as p
 from drivers import dmd
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceRefused,
-    DeviceTimeout,
-    Identity,
-    LoadedSequence,
-    Options,
-    Projector,
-    ProjectorInfo,
-    SequenceLimits,
-)
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.projector import LoadedSequence, Projector, ProjectorInfo, SequenceLimits
 from drivers.clock import NS
 from drivers.dlpc350_flash import FlashImages, Place
 from drivers.dlpc350_protocol import Command, Entry

@@ -4,12 +4,29 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 # As many processes as cores run tests, and some start daemons: threads of a linear algebra
 # library would spin for cores that others need. Read where NumPy is first imported, here or there.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Containers often forbid bytecode; every process that a test starts would compile all of Umbra anew
+# then, which takes longer than most tests of one.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+# The same examples each time, and as slow as the machine is: a test fails for what it has found.
+settings.register_profile(
+    "umbra",
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("umbra")
 
 
 def pytest_runtest_setup() -> None:

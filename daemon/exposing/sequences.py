@@ -40,17 +40,9 @@ from daemon.proof import Proof, head_problem
 from daemon.ring import Buffer
 from daemon.scans.method import Expose, Unsuitable
 from daemon.separation.estimator import Lighting
-from drivers.base import (
-    Acquisition,
-    Camera,
-    DeviceError,
-    DeviceGarbled,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    LoadedSequence,
-    SequenceLimits,
-)
+from drivers.base.camera import Acquisition, Camera, Frame
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceRefused, DeviceTimeout
+from drivers.base.projector import LoadedSequence, SequenceLimits
 from drivers.sequence import mismatch
 from protocol.patterns import BLACK, WHITE
 

@@ -13,7 +13,8 @@ from daemon.separation.estimator import Components, Estimator
 from daemon.separation.mesh import MeshOccluder
 from daemon.separation.steadied import Steadied
 from protocol import mesh as geometry
-from protocol.scans import Mesh, Reference
+from protocol.scans.occluded import Mesh
+from protocol.scans.spec import Reference
 
 _RATE_HZ = 30.0  # where neither the scan nor the camera says
 _EXPOSURE_S = 0.01

@@ -31,7 +31,8 @@ from daemon.separation.registration import (
 )
 from daemon.separation.strength import SourceStrength
 from daemon.separation.warping import aligned
-from protocol.scans import OccluderScan, Reference
+from protocol.scans.occluded import OccluderScan
+from protocol.scans.spec import Reference
 
 O = TypeVar("O", bound=OccluderScan)  # noqa: E741
 

@@ -24,7 +24,8 @@ from daemon.separation.order_estimate import KEEP, RANKS
 from daemon.separation.radiometry import Response
 from daemon.separation.topk import TopK
 from protocol.patterns import BLACK, WHITE, AnyPattern
-from protocol.scans import PatternScan, Radiometry, Reference
+from protocol.scans.projected import PatternScan
+from protocol.scans.spec import Radiometry, Reference
 
 FINE_PX = 64
 """Patterns of larger checkers, patches or periods may light one end of a scene alone."""

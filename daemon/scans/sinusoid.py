@@ -13,7 +13,7 @@ from daemon.separation.estimator import Estimator
 from daemon.separation.radiometry import Response
 from daemon.separation.sinusoid import LeastSquares
 from protocol import patterns
-from protocol.scans import RandomPhase, Sinusoid
+from protocol.scans.projected import RandomPhase, Sinusoid
 
 
 class SinusoidMethod(PatternMethod[Sinusoid]):

@@ -9,9 +9,9 @@ from daemon.scans.occluder import OccluderMethod
 from daemon.separation.coverage import Occluder
 from daemon.separation.estimator import Estimator
 from daemon.separation.steadied import Steadied
-from drivers.base import StageInfo
+from drivers.base.stage import StageInfo
 from protocol.patterns import Axis
-from protocol.scans import Stick
+from protocol.scans.occluded import Stick
 
 _SWEEP_S = 10.0  # of a sweep, where no feed is told
 

@@ -16,8 +16,9 @@ from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
-from protocol.messages import RunInfo, RunState
-from protocol.scans import Mesh, Ready
+from protocol.messages.runs import RunInfo, RunState
+from protocol.scans.occluded import Mesh
+from protocol.scans.spec import Ready
 from tests.benchmarks.bench import Running, daemon
 from tests.benchmarks.ratio import Ratio
 

@@ -16,20 +16,21 @@ from daemon.separation.estimator import Components, Lighting, NotYet, Observatio
 from daemon.separation.exposure_noise import ExposureNoise, Sample, Sensor
 from daemon.separation.pair import ComplementPair
 from daemon.separation.radiometry import FrameMean, Response
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
-from protocol.scans import (
-    AnySeparation,
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
     PatternScan,
-    Radiometry,
     RandomBinary,
     RandomPhase,
-    Reference,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry, Reference
 from tests.daemon.scene import OWN_US
 from tests.daemon.virtual_scene import BLACK, FULL, VirtualScene
 

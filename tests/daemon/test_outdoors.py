@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Quality
-from protocol.scans import Mesh
+from protocol.scans.occluded import Mesh
 from tests.daemon.outdoor_rig import Outdoors, scan
 
 SPEC = Mesh(hole_mm=25.0, pitch_mm=40.0, scene_mm=150.0, sun=True, time_limit_s=60.0)

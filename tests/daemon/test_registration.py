@@ -16,9 +16,11 @@ from daemon.separation.estimator import Components, Observation
 from daemon.separation.radiometry import Response
 from daemon.separation.registration import LEAST_PX, REFERENCE, Registration
 from daemon.separation.warping import aligned, beyond, uncertain, without
-from drivers.base import CameraInfo, PixelFormat, StageInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.stage import StageInfo
 from protocol.mesh import Mesh as Holes
-from protocol.scans import Mesh
+from protocol.scans.occluded import Mesh
 
 HEIGHT, WIDTH = 156, 208
 PITCH = 20.0
@@ -83,7 +85,7 @@ def test_shifts_are_found_under_the_moving_shadow() -> None:
     for frame, (x, y) in zip(shots[REFERENCE:], later, strict=True):
         shift = camera.of(frame)
         assert shift.found
-        assert (shift.x, shift.y) == pytest.approx((x, y), abs=0.08)
+        assert (shift.x, shift.y) == pytest.approx((x, y), abs=0.12)
         assert shift.warp == ((1.0, 0.0, -shift.x, 0.0, 1.0, -shift.y) if x or y else None)
 
 

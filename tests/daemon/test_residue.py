@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from daemon.separation.estimator import Components, Quality
 from daemon.separation.fineness import astray, finer_pattern
 from protocol.patterns import Axis
-from protocol.scans import (
-    AnySeparation,
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Radiometry,
     RandomBinary,
     RandomPhase,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import Scene
 from tests.daemon.virtual_scene import VirtualScene
 

@@ -1,0 +1,50 @@
+"""A method of both clients, written once: a blocking call of one, a coroutine of the other."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
+
+from protocol.connection import Ask
+
+if TYPE_CHECKING:
+    from protocol.aio import AsyncClient
+    from protocol.client import Client
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class command(Generic[P, T]):  # noqa: N801  (a decorator, as property is)
+    """Makes a function that returns an Ask into a method of both clients."""
+
+    def __init__(self, make: Callable[Concatenate[Any, P], Ask[T]]) -> None:
+        functools.update_wrapper(cast("Any", self), make)
+        self._make = make
+
+    @overload
+    def __get__(self, rig: None, owner: type) -> Callable[Concatenate[Any, P], Ask[T]]: ...
+    @overload
+    def __get__(self, rig: Client, owner: type) -> Callable[P, T]: ...
+    @overload
+    def __get__(self, rig: AsyncClient, owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
+    def __get__(self, rig: Any, owner: type) -> Any:
+        if rig is None:
+            return self._make
+
+        @functools.wraps(self._make)
+        def call(*args: P.args, **kwargs: P.kwargs) -> Any:
+            return rig.perform(self._make(rig, *args, **kwargs))
+
+        call.__signature__ = _bound(self._make)  # type: ignore[attr-defined]
+        return call
+
+
+@functools.cache
+def _bound(make: Callable[..., Any]) -> inspect.Signature:
+    """The signature that a person sees: without self, and with what comes back."""
+    whole = inspect.signature(make)
+    back = str(whole.return_annotation).removeprefix("Ask[").removesuffix("]")
+    return whole.replace(parameters=list(whole.parameters.values())[1:], return_annotation=back)
