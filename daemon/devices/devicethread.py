@@ -11,7 +11,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from concurrent.futures import TimeoutError as FutureTimeout
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -26,6 +26,7 @@ T = TypeVar("T")
 
 _IDLE_BEAT_S = 0.25
 _HALT_GRACE_S = 1.0
+_HALT_AGAIN_S = 0.25
 
 log = structlog.get_logger(__name__)
 
@@ -86,6 +87,8 @@ class DeviceThread(Generic[D]):
         self._beat = time.monotonic()
         self._closed = False
         self._due: float | None = None  # when the call under way must have come back
+        self._switching = threading.Lock()
+        self._session: Session | None = None  # of the call under way
         self._thread = threading.Thread(target=self._run, name=f"umbra-{device.name}", daemon=True)
         self._thread.start()
 
@@ -106,9 +109,12 @@ class DeviceThread(Generic[D]):
 
     def wait(self, future: Future[T], deadline_s: float) -> T:
         """Wait for a submitted call as `call` does. A call that is late is halted first."""
-        try:
-            return future.result(deadline_s)
-        except FutureTimeout:
+        deadline = time.monotonic() + deadline_s
+        while (left := deadline - time.monotonic()) > 0:
+            if wait([future], min(left, _HALT_AGAIN_S)).done:
+                return future.result()
+            self.halt_revoked()
+        if not future.done():
             self.device.halt()
         try:
             return future.result(_HALT_GRACE_S)
@@ -119,6 +125,14 @@ class DeviceThread(Generic[D]):
                 f"the driver has not come back in {deadline_s:.3g} s",
                 "check the device's cable and power; umbrad restarts if it stays stuck",
             ) from None
+
+    def halt_revoked(self) -> None:
+        """Halt the call under way if its session has ended: the halt that came with the end is
+        lost where it came between the driver's last look and the call's beginning. For whoever
+        waits for a call; the safe state that follows it is not disturbed."""
+        with self._switching:
+            if self._session is not None and self._session.ended.is_set():
+                self.device.halt()
 
     @property
     def stuck(self) -> bool:
@@ -158,6 +172,8 @@ class DeviceThread(Generic[D]):
             if task is None:
                 return
             self._due = time.monotonic() + task.deadline_s
+            with self._switching:
+                self._session = task.session
             try:
                 if task.session is not None:
                     task.session.check()
@@ -168,5 +184,7 @@ class DeviceThread(Generic[D]):
                 log.exception("a driver broke", device=self.device.name)
                 task.future.set_exception(_broken(self.device.name, error))
             finally:
+                with self._switching:
+                    self._session = None
                 self._due = None
                 del task  # a frame's buffer must not outlive its call here

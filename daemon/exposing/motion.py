@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import TimeoutError as FutureTimeout
+from concurrent.futures import wait
 
 import structlog
 
@@ -40,8 +40,7 @@ def require_homed(
 ) -> StageStatus:
     """Home the stage if its position is not known; its status. `beat` is called meanwhile.
 
-    Raises DeviceRefused for a stage in alarm: somebody must look first. Not repeated: what a
-    stage refuses once it refuses again.
+    Raises DeviceRefused for a stage in alarm: somebody must look first.
     """
     status = stage.call(lambda s: s.status(), CALL_S, session)
     if status.state is StageState.ALARM:
@@ -49,22 +48,18 @@ def require_homed(
             stage.device.name,
             "scan",
             f"it is in alarm: {status.detail}" if status.detail else "it is in alarm",
-            "look at it, then `umbra stage unlock` and `umbra stage home`",
+            "look at it, then `umbra stage unlock`; a scan homes it",
         )
     known = status.state not in {StageState.UNKNOWN, StageState.HOMING}
     if known and status.position_mm is not None:
         return status
     log.info("the stage is homed first")
     homing = stage.submit(lambda s: s.home(HOME_S), HOME_S + CALL_S, session)
-    while True:
+    while not wait([homing], _BEAT_S).done:
         beat()
-        try:
-            homing.result(_BEAT_S)
-        except FutureTimeout:
-            if homing.done():
-                raise
-        else:
-            return stage.call(lambda s: s.status(), CALL_S, session)
+        stage.halt_revoked()
+    homing.result()
+    return stage.call(lambda s: s.status(), CALL_S, session)
 
 
 class Mover:

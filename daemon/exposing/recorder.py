@@ -119,6 +119,7 @@ class Recorder:
         self._changed = threading.Condition()
         self._concluding = threading.Lock()  # once the separator has ended anybody may ask
         self._exposing: Counter[str] = Counter()
+        self._hurried = False
         self._missing_patterns: dict[int, str] = {}  # and why, last
         self._seen_patterns: set[int] = set()
         self._incoming: queue.Queue[Exposed | None] = queue.Queue(maxsize=ring.count + 1)
@@ -202,6 +203,11 @@ class Recorder:
     def exposing(self) -> Mapping[str, int]:
         """The sum of what the records say of it."""
         return dict(self._exposing)
+
+    def hurry(self) -> None:
+        """The run ends without a result: frames are made durable and counted, and taken in no
+        more. A resumed run takes them in from the disk."""
+        self._hurried = True
 
     def finish(self) -> None:
         """Wait until everything is durable and taken in; the workers end. Raises their failure."""
@@ -367,14 +373,16 @@ class Recorder:
                 self._missing_patterns[record.observation.pattern] = record.missing
                 self._tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
             else:
-                self._estimator.update(exposed.frame.pixels, record.observation)
+                if not self._hurried:
+                    self._estimator.update(exposed.frame.pixels, record.observation)
                 self._note(record)
                 self._tally = Tally(
                     tally.recorded + 1,
                     tally.missing,
                     tally.rejected + (not record.observation.used),
                 )
-            self._summary = self._estimator.summary()
+            if not self._hurried:
+                self._summary = self._estimator.summary()
             with self._changed:
                 self._taken_in += 1
                 self._changed.notify_all()

@@ -170,6 +170,12 @@ class ManualStage:
         self._call(lambda s: s.unlock(), self._use(_LEASE_S))
         return self.status()
 
+    def unlock_for_run(self) -> StageStatus:
+        """The same for a run that has the devices, and waits. Raises DeviceError."""
+        with self._rig.noticing():
+            self._thread.call(lambda s: s.unlock(), CALL_S)
+        return self.status()
+
     def finish(self) -> None:
         """Before a scan: wait for the end of homing and of a short motion; stop any other."""
         motion = self._motion

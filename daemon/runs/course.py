@@ -30,7 +30,7 @@ from daemon.exposing.ring import Ring
 from daemon.exposing.sequencer import Sequencer, exposer_for
 from daemon.pictures.viewfinder import Viewfinder
 from daemon.products import separated
-from daemon.runs.ending import close, end_of, of_lost, utc_now, with_exposure
+from daemon.runs.ending import close, end_of, of_lost, requeue, utc_now, with_exposure
 from daemon.runs.failures import as_error
 from daemon.runs.preparation import Preparation
 from daemon.runs.room import Room
@@ -139,7 +139,11 @@ class Course:
                 self._rig.safe_within(futures, SAFE_S)
                 preparation.restore()
                 self._rig.leave(session)
-        close(self.folder, end, self._timings)
+        begun = self.folder.file.state not in {RunState.QUEUED, RunState.WAITING}
+        if end is self.control.verdict and end.state is RunState.INTERRUPTED and not begun:
+            requeue(self.folder)
+        else:
+            close(self.folder, end, self._timings)
         self.standing.changed()
         return end
 
@@ -192,6 +196,7 @@ class Course:
             except BaseException:
                 # Now, for the recorder may wait long for room.
                 self._rig.make_safe(halt=not session.ended.is_set())
+                recorder.hurry()
                 raise
             finally:
                 # Also after an abort: what the camera gave is made durable and counted.

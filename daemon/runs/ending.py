@@ -53,6 +53,17 @@ def of_lost(lost: Mapping[int, str]) -> str:
     return f"no frame could be had of {len(lost)} of the patterns ({some}): {why}"
 
 
+def requeue(folder: RunFolder) -> None:
+    """Of a run that has not begun when the daemon stops: the next start tries again. Never raises,
+    as `close`."""
+    try:
+        folder.update(state=RunState.QUEUED)
+    except (OSError, UmbraError) as error:
+        log.warning("the run's state could not be written yet", problem=str(error))
+        folder.remember(state=RunState.QUEUED)
+    log.info("run goes on waiting after the next start")
+
+
 def close(folder: RunFolder, end: End, timings: Mapping[str, float]) -> None:
     """Write a run's end; never raises. A disk that is full learns of it later (`Runner.tend`)."""
     written = {"state": end.state, "end": end, "ended": utc_now(), "timings": dict(timings)}

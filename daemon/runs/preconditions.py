@@ -5,8 +5,8 @@
      └──── a device's health changed, or it is time to look again
 
 A check raises what stands against the run. What may mend itself is waited for: a device that is
-away, no room on the disk, the wrong light. What will not (a device that refuses, a stage in alarm,
-a scan that does not fit the rig) ends the run at once.
+away, no room on the disk, the wrong light; or somebody may mend it: a stage in alarm. What will not
+(a device that refuses, a scan that does not fit the rig) ends the run at once.
 """
 
 from __future__ import annotations
@@ -42,10 +42,14 @@ log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Precondition:
-    """`check` raises UmbraError or DeviceError while it is not so; `what` is a name for people."""
+    """`check` raises UmbraError or DeviceError while it is not so; `what` is a name for people.
+
+    `mended`: what a device refuses is waited for too, for somebody may mend it meanwhile.
+    """
 
     what: str
     check: Callable[[], None]
+    mended: bool = False
 
 
 class Preconditions:
@@ -108,7 +112,8 @@ class Preconditions:
                 self._control.check(self._session)  # a device that was halted is no failure
                 if isinstance(error, DeviceError):
                     self._on_failure(error)
-                if as_error(error).code not in _MENDS:
+                code = as_error(error).code
+                if code not in _MENDS and not (condition.mended and code is Code.DEVICE_REFUSED):
                     raise
                 return condition.what, error
             self._been.add(condition.what)

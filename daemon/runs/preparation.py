@@ -118,7 +118,7 @@ class Preparation:
             [
                 Precondition("devices", devices),
                 Precondition("disk", disk),
-                Precondition("stage", stage),
+                Precondition("stage", stage, mended=True),
                 *watch.conditions(),
             ],
             clock=self._rig.clock,

@@ -32,7 +32,7 @@ from protocol.messages.events import AnyEvent, Progressed, QueueChanged, RunChan
 from protocol.messages.runs import End, Progress, RunState
 from protocol.scans.anyscan import AnyScan
 
-_UNFINISHED = {RunState.WAITING, RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}
+_UNFINISHED = {RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}
 _RESUMABLE_CODES = {
     Code.DEVICE_LOST,
     Code.DEVICE_TIMEOUT,
@@ -84,9 +84,13 @@ class Runner:
     # ------------------------------------------------------------ the loop
 
     def recover(self) -> None:
-        """After a start: runs that were under way were interrupted, whatever ended the daemon."""
+        """After a start: runs that were under way were interrupted, whatever ended the daemon; one
+        that only waited has lost nothing, and goes on waiting."""
         for run in self._store.runs():
-            if run.file.state in _UNFINISHED:
+            if run.file.state is RunState.WAITING:
+                run.remember(state=RunState.QUEUED)
+                log.info("run goes on waiting", run=run.id)
+            elif run.file.state in _UNFINISHED:
                 reason = "umbrad ended while the run was under way; `umbra resume` goes on with it"
                 end = End(state=RunState.INTERRUPTED, reason=reason)
                 found, how = count(run.path), run.file.sequencing
@@ -200,7 +204,7 @@ class Runner:
         self._course = None
         if not self._stopping:
             await asyncio.to_thread(aftermath.after, course.folder, self._store, self._config)
-        self._publish(QueueChanged(queue=tuple(r.id for r in self._store.queued())))
+        self._publish(QueueChanged(queue=tuple(r.id for r in self.queue())))
         self._on_activity()
 
     def _clear_the_way(self) -> None:
@@ -267,7 +271,8 @@ class Runner:
 
     def queue(self) -> list[RunFolder]:
         """The runs that wait, the next first."""
-        return self._store.queued()
+        current = self.current
+        return [run for run in self._store.queued() if run is not current]
 
     def find(self, run: str) -> RunFolder:
         """A run by its id; "" is the current, else the newest. Raises UmbraError(unknown_run)."""
@@ -316,7 +321,7 @@ class Runner:
     def move(self, run: str, to: int) -> list[RunFolder]:
         """Put a waiting run at another place; gives the new queue."""
         moved = self._waiting(run, "moved in the queue")
-        rest = [r for r in self._store.queued() if r.id != moved.id]
+        rest = [r for r in self.queue() if r.id != moved.id]
         rest.insert(min(to, len(rest)), moved)
         for order, waiting in enumerate(rest):
             if waiting.file.order != order:
@@ -402,5 +407,5 @@ class Runner:
 
     def _queue_changed(self, run: RunFolder) -> None:
         self._publish(RunChanged(run=run.info()))
-        self._publish(QueueChanged(queue=tuple(r.id for r in self._store.queued())))
+        self._publish(QueueChanged(queue=tuple(r.id for r in self.queue())))
         self.wake()

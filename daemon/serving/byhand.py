@@ -26,6 +26,7 @@ from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
 from protocol.messages import commands, replies
 from protocol.messages.rig import CameraSettings
+from protocol.messages.runs import RunState
 from protocol.scans.spec import Radiometry
 
 T = TypeVar("T")
@@ -184,7 +185,14 @@ class ByHand:
         return Answer(await asyncio.to_thread(self._manual.stage.stop))
 
     async def _stage_unlock(self, _: commands.StageUnlock, asked: Asked) -> Answer:
-        return Answer(await self.do(asked, self._manual.stage.unlock))
+        """Also for a run that waits for just this: it has the devices, and homes the stage."""
+        current = self._runner.current
+        if current is None or current.file.state not in {RunState.QUEUED, RunState.WAITING}:
+            return Answer(await self.do(asked, self._manual.stage.unlock))
+        self._manual.admit(asked.token)
+        status = await asyncio.to_thread(self._manual.stage.unlock_for_run)
+        self._runner.wake()
+        return Answer(status)
 
     async def _dark(self, _: commands.Dark, asked: Asked) -> Answer:
         await self.do(asked, self._manual.end)

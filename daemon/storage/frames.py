@@ -189,7 +189,7 @@ class FrameStore:
 
     @property
     def writable(self) -> bool:
-        """Whether `append` and `commit` may be repeated: no fsync failed but for want of room."""
+        """Whether `append` and `commit` may be repeated: if an fsync failed, for want of room."""
         return self._lines is not None and self._lines.writable
 
     # ------------------------------------------------------------ reading
