@@ -123,9 +123,13 @@ class LeastSquares:
         between: dict[str, Any] = {}
         if self._patches:
             split = self._between_patches(ready[0], noise, direct, indirect, np.sqrt(direct_var))
-            direct, indirect = split.direct, direct + indirect - split.direct
-            direct_var += np.square(split.deviation)
-            global_var += np.square(split.deviation)
+            total: Plane = direct + indirect
+            direct, indirect = split.direct, total - split.direct
+            total_std = np.sqrt(np.maximum(global_var - direct_var, np.float32(0.0)))
+            direct_std, global_std = split.stated(
+                np.sqrt(direct_var), np.sqrt(global_var), total, total_std
+            )
+            direct_var, global_var = np.square(direct_std), np.square(global_std)
             quality |= bits(split.known, Quality.EDGE)
             between["edges"] = round(float(np.mean(split.known)), 4)
         if len(solved) > 1:
