@@ -20,7 +20,7 @@ from daemon.config import ConfigError
 from daemon.server import Caller
 from protocol.errors import Code, UmbraError
 from protocol.keys import AllowList, KeyPair, load_server
-from protocol.messages import Role
+from protocol.messages.access import Role
 
 DOMAIN = "umbra"
 

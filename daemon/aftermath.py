@@ -11,9 +11,10 @@ import msgspec
 import structlog
 
 from daemon.config import HooksSection, RigConfig
-from daemon.store import RunFolder, Store
+from daemon.runfolder import RunFolder
+from daemon.store import Store
 from protocol.errors import UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 
 _DAY_S = 86_400.0
 

@@ -39,7 +39,8 @@ from daemon.server import Server
 from daemon.store import Store
 from daemon.viewfinder import Glimpse, Viewfinder
 from protocol.errors import UmbraError
-from protocol.messages import AnyEvent, DeviceChanged, DeviceInfo, Logged, PreviewTaken, RigState
+from protocol.messages.events import AnyEvent, DeviceChanged, Logged, PreviewTaken
+from protocol.messages.rig import DeviceInfo, RigState
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """What ends the daemon in an orderly way: the service manager, Ctrl-C, a terminal that closes."""

@@ -21,11 +21,12 @@ from daemon.scans.pattern_scan import response_of
 from daemon.server import Answer, Asked
 from daemon.store import Store
 from daemon.viewfinder import facts_of
-from drivers.base import CameraSettings as DriverSettings
-from drivers.base import PixelFormat
-from protocol import messages as m
+from drivers.base.camera import CameraSettings as DriverSettings
+from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
-from protocol.scans import Radiometry
+from protocol.messages import commands, replies
+from protocol.messages.rig import CameraSettings
+from protocol.scans.spec import Radiometry
 
 T = TypeVar("T")
 
@@ -49,23 +50,23 @@ class ByHand:
         self._store = store
         self._config = config
         self._estopped = estopped
-        self.table: dict[type[m.Command], Callable[[Any, Asked], Awaitable[Answer]]] = {
-            m.StartLive: self._start_live,
-            m.StopLive: self._stop_live,
-            m.Show: self._show,
-            m.Snap: self._snap,
-            m.SetCamera: self._camera,
-            m.SetLight: self._light,
-            m.GetStage: self._stage,
-            m.StageHome: self._stage_home,
-            m.StageMove: self._stage_move,
-            m.StageCircle: self._stage_circle,
-            m.StageStop: self._stage_stop,
-            m.StageUnlock: self._stage_unlock,
-            m.Dark: self._dark,
-            m.Lock: self._lock,
-            m.RenewLock: self._renew,
-            m.Unlock: self._unlock,
+        self.table: dict[type[commands.Command], Callable[[Any, Asked], Awaitable[Answer]]] = {
+            commands.StartLive: self._start_live,
+            commands.StopLive: self._stop_live,
+            commands.Show: self._show,
+            commands.Snap: self._snap,
+            commands.SetCamera: self._camera,
+            commands.SetLight: self._light,
+            commands.GetStage: self._stage,
+            commands.StageHome: self._stage_home,
+            commands.StageMove: self._stage_move,
+            commands.StageCircle: self._stage_circle,
+            commands.StageStop: self._stage_stop,
+            commands.StageUnlock: self._stage_unlock,
+            commands.Dark: self._dark,
+            commands.Lock: self._lock,
+            commands.RenewLock: self._renew,
+            commands.Unlock: self._unlock,
         }
 
     async def do(self, asked: Asked, act: Callable[[], T]) -> T:
@@ -89,7 +90,7 @@ class ByHand:
                 f"{current.id} is using the devices; wait for it, or `umbra abort`",
             )
 
-    async def _start_live(self, command: m.StartLive, asked: Asked) -> Answer:
+    async def _start_live(self, command: commands.StartLive, asked: Asked) -> Answer:
         def look() -> None:
             bench = None
             if command.separate is not None:
@@ -97,7 +98,7 @@ class ByHand:
             self._manual.look(command.rate_hz, command.lease_s, command.separate, bench)
 
         await self.do(asked, look)
-        return Answer(m.Done(message=f"live for {command.lease_s:g} s, unless asked again"))
+        return Answer(replies.Done(message=f"live for {command.lease_s:g} s, unless asked again"))
 
     def _calibration(self) -> dict[str, Any]:
         """The values that apply to the rig as it is now."""
@@ -119,93 +120,93 @@ class ByHand:
             raise UmbraError(Code.UNSUITABLE, "a recording's exposure is as it was taken")
         return self._manual.expose(wanted, response_of(Radiometry(), bench)).facts()
 
-    async def _stop_live(self, _: m.StopLive, __: Asked) -> Answer:
+    async def _stop_live(self, _: commands.StopLive, __: Asked) -> Answer:
         await asyncio.to_thread(self._manual.live.stop)
-        return Answer(m.Done(message="the live view has ended"))
+        return Answer(replies.Done(message="the live view has ended"))
 
-    async def _show(self, command: m.Show, asked: Asked) -> Answer:
+    async def _show(self, command: commands.Show, asked: Asked) -> Answer:
         await self.do(asked, lambda: self._manual.show(command.pattern, command.lease_s))
         return Answer(
-            m.Done(message=f"shown; dark in {command.lease_s:g} s, or with `umbra show off`")
+            replies.Done(message=f"shown; dark in {command.lease_s:g} s, or with `umbra show off`")
         )
 
-    async def _snap(self, command: m.Snap, asked: Asked) -> Answer:
+    async def _snap(self, command: commands.Snap, asked: Asked) -> Answer:
         def snap() -> Answer:
             frame, info = self._manual.snap()
             facts = facts_of(frame, info)
             if not command.png:
-                return Answer(m.Picture(facts=facts), {"frame": frame.pixels})
+                return Answer(replies.Picture(facts=facts), {"frame": frame.pixels})
             shown = picture.png(frame.pixels, info.pixel_format, demosaiced=command.demosaic)
-            return Answer(m.Picture(facts=facts), {"png": shown})
+            return Answer(replies.Picture(facts=facts), {"png": shown})
 
         return await self.do(asked, snap)
 
-    async def _camera(self, command: m.SetCamera, asked: Asked) -> Answer:
+    async def _camera(self, command: commands.SetCamera, asked: Asked) -> Answer:
         wanted = _settings(command.settings)
         if command.auto_exposure:
             facts = await self.do(asked, lambda: self._expose(wanted))
             in_force = self._rig.camera.device.settings()
-            return Answer(m.Camera(settings=m.CameraSettings(**asdict(in_force)), facts=facts))
+            return Answer(replies.Camera(settings=CameraSettings(**asdict(in_force)), facts=facts))
         if wanted == DriverSettings():
             in_force = self._rig.camera.device.settings()
         else:
             in_force = await self.do(asked, lambda: self._manual.configure(wanted))
-        return Answer(m.Camera(settings=m.CameraSettings(**asdict(in_force))))
+        return Answer(replies.Camera(settings=CameraSettings(**asdict(in_force))))
 
-    async def _light(self, command: m.SetLight, asked: Asked) -> Answer:
+    async def _light(self, command: commands.SetLight, asked: Asked) -> Answer:
         await self.do(asked, lambda: self._manual.light(command.name, command.on))
-        return Answer(m.Done(message=f"{command.name} is {'on' if command.on else 'off'}"))
+        return Answer(replies.Done(message=f"{command.name} is {'on' if command.on else 'off'}"))
 
-    async def _stage(self, _: m.GetStage, __: Asked) -> Answer:
+    async def _stage(self, _: commands.GetStage, __: Asked) -> Answer:
         return Answer(await asyncio.to_thread(self._manual.stage.status))
 
-    async def _stage_home(self, command: m.StageHome, asked: Asked) -> Answer:
+    async def _stage_home(self, command: commands.StageHome, asked: Asked) -> Answer:
         home = self._manual.stage.home
         return Answer(await self.do(asked, lambda: home(command.timeout_s)))
 
-    async def _stage_move(self, command: m.StageMove, asked: Asked) -> Answer:
-        def move() -> m.StageStatus:
+    async def _stage_move(self, command: commands.StageMove, asked: Asked) -> Answer:
+        def move() -> replies.StageStatus:
             return self._manual.stage.move(command.x_mm, command.y_mm, command.feed_mm_s)
 
         return Answer(await self.do(asked, move))
 
-    async def _stage_circle(self, command: m.StageCircle, asked: Asked) -> Answer:
-        def circle() -> m.StageStatus:
+    async def _stage_circle(self, command: commands.StageCircle, asked: Asked) -> Answer:
+        def circle() -> replies.StageStatus:
             return self._manual.stage.circle(
                 command.centre_mm, command.radius_mm, command.feed_mm_s, command.turns
             )
 
         return Answer(await self.do(asked, circle))
 
-    async def _stage_stop(self, _: m.StageStop, __: Asked) -> Answer:
+    async def _stage_stop(self, _: commands.StageStop, __: Asked) -> Answer:
         """Whoever holds the rig: to stop is never refused, but a run is aborted, not stopped."""
         self.require_no_run()
         return Answer(await asyncio.to_thread(self._manual.stage.stop))
 
-    async def _stage_unlock(self, _: m.StageUnlock, asked: Asked) -> Answer:
+    async def _stage_unlock(self, _: commands.StageUnlock, asked: Asked) -> Answer:
         return Answer(await self.do(asked, self._manual.stage.unlock))
 
-    async def _dark(self, _: m.Dark, asked: Asked) -> Answer:
+    async def _dark(self, _: commands.Dark, asked: Asked) -> Answer:
         await self.do(asked, self._manual.end)
-        return Answer(m.Done(message="dark"))
+        return Answer(replies.Done(message="dark"))
 
-    async def _lock(self, command: m.Lock, asked: Asked) -> Answer:
+    async def _lock(self, command: commands.Lock, asked: Asked) -> Answer:
         token = await self.do(
             asked, lambda: self._manual.lock(command.owner, command.note, command.lease_s)
         )
         self._runner.hold(LOCK)
-        return Answer(m.Locked(token=token, lease_s=command.lease_s))
+        return Answer(replies.Locked(token=token, lease_s=command.lease_s))
 
-    async def _renew(self, _: m.RenewLock, asked: Asked) -> Answer:
-        return Answer(m.Locked(token=asked.token, lease_s=self._manual.renew(asked.token)))
+    async def _renew(self, _: commands.RenewLock, asked: Asked) -> Answer:
+        return Answer(replies.Locked(token=asked.token, lease_s=self._manual.renew(asked.token)))
 
-    async def _unlock(self, command: m.Unlock, asked: Asked) -> Answer:
+    async def _unlock(self, command: commands.Unlock, asked: Asked) -> Answer:
         await asyncio.to_thread(self._manual.unlock, asked.token, force=command.force)
         self._runner.release(LOCK)
-        return Answer(m.Done(message="the rig is free"))
+        return Answer(replies.Done(message="the rig is free"))
 
 
-def _settings(wanted: m.CameraSettings) -> DriverSettings:
+def _settings(wanted: CameraSettings) -> DriverSettings:
     pixel_format = None
     if wanted.pixel_format is not None:
         try:

@@ -13,10 +13,11 @@ from typing import Any
 
 import msgspec
 
-from daemon.store import RunFolder, Store
+from daemon.runfolder import RunFolder
+from daemon.store import Store
 from protocol.errors import UmbraError
-from protocol.messages import RunState
-from protocol.scans import Calibration
+from protocol.messages.runs import RunState
+from protocol.scans.calibrations import Calibration
 
 PRODUCT = "calibration"
 """The name of the product that has the figures; what applies is under its key `values`."""

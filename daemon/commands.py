@@ -15,19 +15,26 @@ from daemon import __version__, discovery, measured, picture, products
 from daemon.byhand import ByHand
 from daemon.config import RigConfig
 from daemon.doctor.examination import Doctor
+from daemon.drawing import draw
 from daemon.logs import LogBook
 from daemon.manual import Manual
 from daemon.publisher import Publisher
 from daemon.reprocessor import Reprocessor
 from daemon.rig import SAFE_S, Rig
+from daemon.runfolder import RunFolder
 from daemon.runner import Runner
 from daemon.scans import catalog
 from daemon.separation.estimator import Components, Result
 from daemon.server import Answer, Asked, Caller
-from daemon.store import RunFolder, Store
+from daemon.store import Store
 from daemon.viewfinder import Glimpse, Viewfinder, cells
-from protocol import messages as m
 from protocol.errors import Code, UmbraError
+from protocol.messages import commands, replies
+from protocol.messages.access import Role
+from protocol.messages.envelopes import PROTOCOL
+from protocol.messages.events import RigChanged
+from protocol.messages.rig import RigState
+from protocol.messages.runs import RunInfo, RunState
 
 ESTOP = "estop"
 """An emergency stop: the reason to hold the queue, and its mark in the data folder."""
@@ -77,35 +84,36 @@ class Commands:
         )
         self._results = asyncio.Semaphore(1)  # one at a time: each takes the estimator's thread
         self.stopping = False
-        self._table: dict[type[m.Command], Callable[[Any, Asked], Awaitable[Answer]]] = {
-            m.Hello: self._hello,
-            m.GetStatus: self._status,
-            m.GetDevices: self._devices,
-            m.Discover: self._discover,
-            m.Examine: self._examine,
-            m.Submit: self._submit,
-            m.Reprocess: self._reprocess,
-            m.GetQueue: self._queue,
-            m.MoveQueued: self._move,
-            m.Pause: self._pause,
-            m.Resume: self._resume,
-            m.Abort: self._abort,
-            m.EStop: self._estop,
-            m.Reset: self._reset,
-            m.ListRuns: self._runs,
-            m.GetRun: self._run,
-            m.GetResult: self._result,
-            m.GetProduct: self._product,
-            m.GetLog: self._log,
-            m.GetPreview: self._preview,
+        self._table: dict[type[commands.Command], Callable[[Any, Asked], Awaitable[Answer]]] = {
+            commands.Hello: self._hello,
+            commands.GetStatus: self._status,
+            commands.GetDevices: self._devices,
+            commands.Discover: self._discover,
+            commands.Examine: self._examine,
+            commands.Submit: self._submit,
+            commands.Reprocess: self._reprocess,
+            commands.GetQueue: self._queue,
+            commands.MoveQueued: self._move,
+            commands.Pause: self._pause,
+            commands.Resume: self._resume,
+            commands.Abort: self._abort,
+            commands.EStop: self._estop,
+            commands.Reset: self._reset,
+            commands.ListRuns: self._runs,
+            commands.GetRun: self._run,
+            commands.GetResult: self._result,
+            commands.GetProduct: self._product,
+            commands.GetLog: self._log,
+            commands.GetPreview: self._preview,
+            commands.Draw: self._draw,
             **self._by_hand.table,
         }
 
     async def handle(
-        self, command: m.AnyCommand, caller: Caller, request_id: str, token: str
+        self, command: commands.AnyCommand, caller: Caller, request_id: str, token: str
     ) -> Answer:
         """Do a command. Raises UmbraError or DeviceError."""
-        if self.stopping and command.role is m.Role.OPERATOR:
+        if self.stopping and command.role is Role.OPERATOR:
             raise UmbraError(Code.STOPPING, "umbrad is shutting down; ask again when it is back")
         return await self._table[type(command)](command, Asked(caller, request_id, token))
 
@@ -115,26 +123,26 @@ class Commands:
         self.changed(reason)
 
     @property
-    def state(self) -> m.RigState:
+    def state(self) -> RigState:
         """What the rig as a whole is doing."""
         if self.stopping:
-            return m.RigState.STOPPING
+            return RigState.STOPPING
         if self._estopped:
-            return m.RigState.ESTOPPED
+            return RigState.ESTOPPED
         if (current := self._runner.current) is not None:
             of = {
-                m.RunState.WAITING: m.RigState.WAITING,
-                m.RunState.PAUSED: m.RigState.PAUSED,
+                RunState.WAITING: RigState.WAITING,
+                RunState.PAUSED: RigState.PAUSED,
             }
-            return of.get(current.file.state, m.RigState.SCANNING)
-        return m.RigState.MANUAL if self._manual.active else m.RigState.IDLE
+            return of.get(current.file.state, RigState.SCANNING)
+        return RigState.MANUAL if self._manual.active else RigState.IDLE
 
     # ------------------------------------------------------------ facts
 
-    async def _hello(self, _: m.Hello, asked: Asked) -> Answer:
+    async def _hello(self, _: commands.Hello, asked: Asked) -> Answer:
         return Answer(
-            m.Welcome(
-                protocol=m.PROTOCOL,
+            replies.Welcome(
+                protocol=PROTOCOL,
                 server=__version__,
                 rig=self._config.rig.name,
                 epoch=self._epoch,
@@ -145,10 +153,10 @@ class Commands:
             )
         )
 
-    async def _status(self, _: m.GetStatus, __: Asked) -> Answer:
+    async def _status(self, _: commands.GetStatus, __: Asked) -> Answer:
         current = self._runner.current
         return Answer(
-            m.Status(
+            replies.Status(
                 rig=self._config.rig.name,
                 state=self.state,
                 epoch=self._epoch,
@@ -165,7 +173,7 @@ class Commands:
             )
         )
 
-    def _counted(self, run: RunFolder) -> m.RunInfo:
+    def _counted(self, run: RunFolder) -> RunInfo:
         """A run as it is now; its counts are written at its end only, so they are asked for."""
         info = run.info()
         for progress in (self._runner.progress, self._reprocessor.progress):
@@ -178,18 +186,18 @@ class Commands:
                 )
         return info
 
-    async def _devices(self, _: m.GetDevices, __: Asked) -> Answer:
-        return Answer(m.Devices(devices=self._rig.devices()))
+    async def _devices(self, _: commands.GetDevices, __: Asked) -> Answer:
+        return Answer(replies.Devices(devices=self._rig.devices()))
 
-    async def _discover(self, command: m.Discover, asked: Asked) -> Answer:
+    async def _discover(self, command: commands.Discover, asked: Asked) -> Answer:
         self._manual.admit(asked.token)
         self._by_hand.require_no_run()
         searches = await discovery.discover(
             command.drivers, command.timeout_s, self._config.devices, self._rig.devices()
         )
-        return Answer(m.Discovered(searches=searches))
+        return Answer(replies.Discovered(searches=searches))
 
-    async def _examine(self, command: m.Examine, asked: Asked) -> Answer:
+    async def _examine(self, command: commands.Examine, asked: Asked) -> Answer:
         doctor = self._doctor
         if not command.passive:
             self._by_hand.require(asked)
@@ -197,17 +205,17 @@ class Commands:
         checks = await asyncio.to_thread(doctor.look, run_writes=writes)
         if not command.passive:
             checks += await self._by_hand.do(asked, doctor.expose)
-        return Answer(m.Examined(checks=tuple(checks)))
+        return Answer(replies.Examined(checks=tuple(checks)))
 
-    async def _log(self, command: m.GetLog, _: Asked) -> Answer:
+    async def _log(self, command: commands.GetLog, _: Asked) -> Answer:
         if command.run:
             await asyncio.to_thread(self._store.open, command.run)  # a name that is wrong is said
         records = await asyncio.to_thread(self._book.records, command.run, command.limit)
-        return Answer(m.Log(records=records))
+        return Answer(replies.Log(records=records))
 
     # ------------------------------------------------------------ runs
 
-    async def _submit(self, command: m.Submit, asked: Asked) -> Answer:
+    async def _submit(self, command: commands.Submit, asked: Asked) -> Answer:
         if (known := self._runner.submitted(asked.request_id)) is not None:
             return _about(known)
         self._manual.admit(asked.token)
@@ -225,17 +233,17 @@ class Commands:
         )
         return _about(run)
 
-    async def _reprocess(self, command: m.Reprocess, asked: Asked) -> Answer:
+    async def _reprocess(self, command: commands.Reprocess, asked: Asked) -> Answer:
         """Neither a lock nor an emergency stop keeps anybody from it: it touches no device."""
         by = command.by or asked.caller.name
         return _about(
             await asyncio.to_thread(self._reprocessor.submit, command, by, asked.request_id)
         )
 
-    async def _queue(self, _: m.GetQueue, __: Asked) -> Answer:
-        return Answer(m.Runs(runs=tuple(run.info() for run in self._runner.queue())))
+    async def _queue(self, _: commands.GetQueue, __: Asked) -> Answer:
+        return Answer(replies.Runs(runs=tuple(run.info() for run in self._runner.queue())))
 
-    async def _move(self, command: m.MoveQueued, asked: Asked) -> Answer:
+    async def _move(self, command: commands.MoveQueued, asked: Asked) -> Answer:
         self._manual.admit(asked.token)
         if self._reprocessor.mine(command.run) is not None:
             raise UmbraError(
@@ -243,19 +251,19 @@ class Commands:
                 f"{command.run} is made from another run's frames: it waits beside the queue",
             )
         queue = await asyncio.to_thread(self._runner.move, command.run, command.to)
-        return Answer(m.Runs(runs=tuple(run.info() for run in queue)))
+        return Answer(replies.Runs(runs=tuple(run.info() for run in queue)))
 
-    async def _pause(self, command: m.Pause, asked: Asked) -> Answer:
+    async def _pause(self, command: commands.Pause, asked: Asked) -> Answer:
         self._manual.admit(asked.token)
         return _about(self._runner.pause(command.run))
 
-    async def _resume(self, command: m.Resume, asked: Asked) -> Answer:
+    async def _resume(self, command: commands.Resume, asked: Asked) -> Answer:
         if (mine := self._reprocessor.mine(command.run)) is not None:
             return _about(await asyncio.to_thread(self._reprocessor.resume, mine))
         self._manual.admit(asked.token)
         return _about(await asyncio.to_thread(self._runner.resume, command.run))
 
-    async def _abort(self, command: m.Abort, asked: Asked) -> Answer:
+    async def _abort(self, command: commands.Abort, asked: Asked) -> Answer:
         by = command.by or asked.caller.name
         # Here and not in a worker: what waits for the workers must not delay it.
         current = self._runner.abort_current(command.run, by)
@@ -265,7 +273,7 @@ class Commands:
             current = await asyncio.to_thread(self._runner.abort, command.run, by)
         return _about(current)
 
-    async def _estop(self, command: m.EStop, asked: Asked) -> Answer:
+    async def _estop(self, command: commands.EStop, asked: Asked) -> Answer:
         by = command.by or asked.caller.name
         self._estopped = True
         self._runner.hold(ESTOP)
@@ -277,36 +285,40 @@ class Commands:
         self.changed(f"emergency stop{f' by {by}' if by else ''}")
         if not safe:
             return Answer(
-                m.Done(message="stopped, but not every device said that it is safe: look at it")
+                replies.Done(
+                    message="stopped, but not every device said that it is safe: look at it"
+                )
             )
-        return Answer(m.Done(message="stopped: dark and held; `umbra reset` ends it"))
+        return Answer(replies.Done(message="stopped: dark and held; `umbra reset` ends it"))
 
-    async def _reset(self, _: m.Reset, __: Asked) -> Answer:
+    async def _reset(self, _: commands.Reset, __: Asked) -> Answer:
         await asyncio.to_thread(self._rig.require_ready)
         await asyncio.to_thread(self._store.unmark, ESTOP)
         self._rig.unlatch()
         self._estopped = False
         self._runner.release(ESTOP)
         self.changed("reset")
-        return Answer(m.Done(message="the queue goes on"))
+        return Answer(replies.Done(message="the queue goes on"))
 
-    async def _runs(self, command: m.ListRuns, _: Asked) -> Answer:
-        def listed() -> tuple[m.RunInfo, ...]:
+    async def _runs(self, command: commands.ListRuns, _: Asked) -> Answer:
+        def listed() -> tuple[RunInfo, ...]:
             runs = self._store.runs()
             chosen = (r for r in runs if command.state is None or r.file.state is command.state)
             return tuple(self._counted(run) for run in itertools.islice(chosen, command.limit))
 
-        return Answer(m.Runs(runs=await asyncio.to_thread(listed)))
+        return Answer(replies.Runs(runs=await asyncio.to_thread(listed)))
 
-    async def _run(self, command: m.GetRun, _: Asked) -> Answer:
+    async def _run(self, command: commands.GetRun, _: Asked) -> Answer:
         run = await asyncio.to_thread(self._runner.find, command.run)
-        return Answer(m.Run(run=self._counted(run)))
+        return Answer(replies.Run(run=self._counted(run)))
 
-    async def _result(self, command: m.GetResult, _: Asked) -> Answer:
+    async def _result(self, command: commands.GetResult, _: Asked) -> Answer:
         def result() -> Answer:
             run = self._runner.find(command.run)
             found, facts = self._result_of(run)
-            reply = m.Result(run=run.info(), final=run.file.state is m.RunState.DONE, facts=facts)
+            reply = replies.Result(
+                run=run.info(), final=run.file.state is RunState.DONE, facts=facts
+            )
             if not isinstance(found, Components):
                 return Answer(reply)
             return Answer(
@@ -326,7 +338,7 @@ class Commands:
         measurement = measured.read(run)
         return (measurement, measurement.facts) if measurement else products.read(run)
 
-    async def _product(self, command: m.GetProduct, _: Asked) -> Answer:
+    async def _product(self, command: commands.GetProduct, _: Asked) -> Answer:
         def part() -> Answer:
             run = self._store.open(command.run)
             path = run.product(command.name)
@@ -336,12 +348,13 @@ class Commands:
                 data = np.frombuffer(file.read(command.limit), np.uint8)
             product = next(p for p in run.file.products if p.name == command.name)
             return Answer(
-                m.ProductPart(product=product, offset=command.offset, size=size), {"data": data}
+                replies.ProductPart(product=product, offset=command.offset, size=size),
+                {"data": data},
             )
 
         return await asyncio.to_thread(part)
 
-    async def _preview(self, command: m.GetPreview, _: Asked) -> Answer:
+    async def _preview(self, command: commands.GetPreview, _: Asked) -> Answer:
         def look() -> Answer:
             if command.what == "frame":
                 glimpse = self._viewfinder.latest()
@@ -361,17 +374,24 @@ class Commands:
             plane = components.direct if command.what == "direct" else components.global_
             shown = picture.component(plane, command.width)
             return Answer(
-                m.Picture(facts={"run": run.id, "what": command.what}), {"preview": shown}
+                replies.Picture(facts={"run": run.id, "what": command.what}), {"preview": shown}
             )
 
         return await asyncio.to_thread(look)
+
+    async def _draw(self, command: commands.Draw, _: Asked) -> Answer:
+        drawn = await asyncio.to_thread(
+            draw, command.spec, command.image, command.width, command.height, command.gamma
+        )
+        facts = {"images": drawn.images, "lighting": drawn.lighting.value}
+        return Answer(replies.Picture(facts=facts), {"png": drawn.png})
 
     # ------------------------------------------------------------ events
 
     def changed(self, reason: str = "") -> None:
         """Tell subscribers that the rig's state or lock changed; from the loop."""
         self._publisher.publish(
-            m.RigChanged(state=self.state, lock=self._manual.lock_info(), reason=reason)
+            RigChanged(state=self.state, lock=self._manual.lock_info(), reason=reason)
         )
 
 
@@ -379,8 +399,10 @@ def _looked(glimpse: Glimpse, width: int) -> Answer:
     small = picture.narrowed(glimpse.picture, width)
     arrays = {"preview": small, "saturated": cells(glimpse.saturated, *small.shape[:2])}
     age_s = round(time.monotonic() - glimpse.at_s, 1)
-    return Answer(m.Picture(facts={**glimpse.facts, "run": glimpse.run, "age_s": age_s}), arrays)
+    return Answer(
+        replies.Picture(facts={**glimpse.facts, "run": glimpse.run, "age_s": age_s}), arrays
+    )
 
 
 def _about(run: RunFolder) -> Answer:
-    return Answer(m.Run(run=run.info()))
+    return Answer(replies.Run(run=run.info()))

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from daemon.devicethread import Revoked, Session
-from protocol.messages import End, RunState
+from protocol.messages.runs import End, RunState
 
 _CHECK_S = 0.25
 

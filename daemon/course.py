@@ -33,19 +33,23 @@ from daemon.preparation import Preparation
 from daemon.recorder import Exposed, Recorder, Tally
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Ring
+from daemon.room import Room
+from daemon.runfolder import RunFolder
 from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet, Result
 from daemon.sequencer import Sequencer, exposer_for
 from daemon.standing import Standing
-from daemon.store import RunFolder, Store
+from daemon.store import Store
 from daemon.viewfinder import Viewfinder
-from drivers.base import CameraInfo, DeviceError
+from drivers.base.camera import CameraInfo
+from drivers.base.errors import DeviceError
 from drivers.clock import NS
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Progress, RunState
-from protocol.scans import AnyScan, OccluderScan, PatternScan
+from protocol.messages.runs import End, Progress, RunState
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import OccluderScan
+from protocol.scans.projected import PatternScan
 
-_ROOM_S = 1.0
 _RESULT_S = 30.0
 TRUTH_S = 60.0
 SUN_DEG_PER_HOUR = 15.0
@@ -77,12 +81,11 @@ class Course:
         self._viewfinder = viewfinder
         self.standing = Standing(folder, rig.clock, on_change=on_change, on_progress=on_progress)
         self._recorder: Recorder | None = None
-        self._room_seen = 0.0
+        self._room = Room(store, self.control)
         self._timings: dict[str, float] = {}
         self._exposed: Counter[str] = Counter()  # see `Choice.facts`
         self._reason = ""  # why the steps ended
         self._broke_off = ""  # when an interrupted run took its last frame
-        self._for_room = False  # the pause is for lack of room on the disk
 
     # ------------------------------------------------------------ for others
 
@@ -326,16 +329,7 @@ class Course:
         self.standing.live()
         if self.folder.file.state is RunState.PAUSED and not self.control.paused:
             self.standing.goes_on()  # it was resumed while it was being paused
-        now = time.monotonic()
-        if now - self._room_seen < _ROOM_S:
-            return
-        self._room_seen = now
-        if not self.control.paused and not self._store.room_for(0):
-            self._for_room = True
-            self.control.pause(
-                f"only {self._store.free_bytes() / 1e6:.0f} MB are free in "
-                f"{self._config.rig.data}, less than the reserve: free some, then `umbra resume`"
-            )
+        self._room.look()
 
     def _paused(self, reason: str) -> None:
         """The sequencer has stopped at a checkpoint; comes back when it may go on."""
@@ -348,9 +342,7 @@ class Course:
         """The disk took no more, reserve or not (recorder's thread): a pause, in which the frame
         keeps its buffer. Comes back to write it again; raises the error when the run ends."""
         if self.control.verdict is None:
-            reason = f"{error.message.partition(';')[0]}; free some, then `umbra resume`"
-            self._for_room = True
-            self.control.pause(reason)
+            reason = self._room.refused(error)
             # The sequencer says so too when it gets there, which it may not after the last frame.
             self._paused(reason)
         if not self.control.await_resume():
@@ -358,13 +350,7 @@ class Course:
 
     def resumed(self) -> None:
         """The pause is over. Raises UmbraError(storage_full) if there is still no room."""
-        if self._for_room and not self._store.room_for(0):
-            raise UmbraError(
-                Code.STORAGE_FULL,
-                f"only {self._store.free_bytes() / 1e6:.0f} MB are free in "
-                f"{self._config.rig.data}, less than the reserve: free some, then `umbra resume`",
-            )
-        self._for_room = False
+        self._room.require()
         if self.folder.file.state is RunState.PAUSED:
             self.standing.goes_on()
         self.control.resume()

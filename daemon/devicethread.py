@@ -18,7 +18,8 @@ from typing import Any, Generic, TypeVar
 
 import structlog
 
-from drivers.base import Device, DeviceError, DeviceGarbled, DeviceTimeout
+from drivers.base.device import Device
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceTimeout
 
 D = TypeVar("D", bound=Device)
 T = TypeVar("T")

@@ -19,9 +19,11 @@ import structlog
 
 from daemon.config import DeviceTable
 from drivers import registry
-from drivers.base import Device, DeviceError
+from drivers.base.device import Device
+from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
-from protocol.messages import DeviceInfo, Found, Search
+from protocol.messages.findings import Found, Search
+from protocol.messages.rig import DeviceInfo
 
 _START_S = 60.0
 _ASKED = b"\n"  # what the process says first, when the driver is about to be asked

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import radiometry
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 
 Picture = NDArray[np.uint8]
 """(h, w, 3) sRGB, RGB order."""

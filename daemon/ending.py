@@ -9,10 +9,10 @@ from typing import Any
 
 import structlog
 
+from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Result
-from daemon.store import RunFolder
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, RunState
+from protocol.messages.runs import End, RunState
 
 log = structlog.get_logger(__name__)
 

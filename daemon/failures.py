@@ -7,7 +7,7 @@ import errno
 from daemon.devicethread import Revoked
 from daemon.scans.method import Unsuitable
 from daemon.separation.estimator import NotYet
-from drivers.base import (
+from drivers.base.errors import (
     DeviceError,
     DeviceGarbled,
     DeviceLost,

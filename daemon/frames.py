@@ -5,21 +5,14 @@ since the last one durable, then their names and the array's new length, and onl
 lines of `frames.jsonl` that acknowledge them. So a line always has its pixels, and whatever has no
 line was never acknowledged: it is removed when the folder is opened again.
 
-`frames.zarr` is a plain Zarr v3 array (frame, y, x[, c]) that zarr, dask, xarray and napari open.
-Each frame is one shard and so one file, row bands of about 1 MiB are its inner chunks. They are
-not compressed: a shard is then the frame's bytes followed by an index that is the same for all
-frames, so that a frame costs a bare write and a checksum. Measured side by side: 0.6 ms at
-1024 x 768 of 8 bits (zarr-python's own pipeline 9 ms, with zstd level 1 12 ms), and at 2448 x 2048
-of 16 bits 36 ms where the bare write took 34 (71 ms, 84 ms). A missing frame
-has no shard, which Zarr reads as zeros.
+Each frame is a shard of its own (`daemon.shards`); a missing one has none, which Zarr reads as
+zeros.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import shutil
-import struct
 import zlib
 from array import array
 from pathlib import Path
@@ -33,15 +26,13 @@ from daemon import journal
 from daemon.durable import Damaged, atomic_write, fsync_file, fsync_folder, storage
 from daemon.journal import Journal
 from daemon.separation.estimator import Observation
+from daemon.shards import Layout
 from protocol.errors import Code, UmbraError
 from protocol.patterns import AnyPattern
 
 ARRAY = "frames.zarr"
 LINES = "frames.jsonl"
-
-_BAND = 1 << 20
 _NO_PIXELS = -1
-_DTYPES = ("uint8", "uint16")
 
 
 class FrameRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -84,7 +75,7 @@ class FrameStore:
     been opened again.
     """
 
-    def __init__(self, folder: Path, layout: _Layout | None, lines: Journal | None) -> None:
+    def __init__(self, folder: Path, layout: Layout | None, lines: Journal | None) -> None:
         """Use `create` or `open`."""
         self.folder = folder
         self._layout = layout
@@ -104,7 +95,7 @@ class FrameStore:
         layout = None
         with storage("creating frames.zarr"):
             if pixels:
-                layout = _Layout(shape, np.dtype(dtype))
+                layout = Layout(shape, np.dtype(dtype))
                 if (folder / ARRAY).exists() and not (folder / LINES).exists():
                     shutil.rmtree(folder / ARRAY)  # left by a crash within this very function
                 (folder / ARRAY).mkdir()
@@ -121,7 +112,7 @@ class FrameStore:
         compared by `read` and `verify`.
         """
         records = journal.read(folder / LINES, FrameRecord)
-        layout = _Layout.read(folder / ARRAY) if (folder / ARRAY).is_dir() else None
+        layout = Layout.read(folder / ARRAY) if (folder / ARRAY).is_dir() else None
         store = cls(folder, layout, None)
         for i, record in enumerate(records):
             if record.index != i:
@@ -263,7 +254,7 @@ class FrameStore:
     def _shard(self, index: int) -> Path:
         return self.folder / ARRAY / f"c.{index}{self._layout.suffix if self._layout else ''}"
 
-    def _sync_shards(self, layout: _Layout) -> None:
+    def _sync_shards(self, layout: Layout) -> None:
         for record in self._pending:
             if not record.missing:
                 with storage(f"recording frame {record.index}"):
@@ -275,7 +266,7 @@ class FrameStore:
         with storage("recording frames.zarr"):  # fsyncs the folder too, with the shards' names
             atomic_write(self.folder / ARRAY / "zarr.json", layout.metadata(len(self)))
 
-    def _check_shards(self, layout: _Layout) -> None:
+    def _check_shards(self, layout: Layout) -> None:
         for index, checksum in enumerate(self._checksums):
             path = self._shard(index)
             if checksum != _NO_PIXELS and (
@@ -283,7 +274,7 @@ class FrameStore:
             ):
                 raise _damaged(index, path)
 
-    def _forget_unacknowledged(self, layout: _Layout) -> None:
+    def _forget_unacknowledged(self, layout: Layout) -> None:
         pixels = {self._shard(i).name for i, c in enumerate(self._checksums) if c != _NO_PIXELS}
         with storage(f"opening {ARRAY}"):
             for path in (self.folder / ARRAY).iterdir():
@@ -292,80 +283,6 @@ class FrameStore:
                     path.unlink()
             atomic_write(self.folder / ARRAY / "zarr.json", layout.metadata(len(self)))
             fsync_folder(self.folder)
-
-
-class _Layout:
-    """Where a frame's bytes are in its shard, and the array's metadata (Zarr v3, sharding 1.0)."""
-
-    def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        if dtype.name not in _DTYPES or len(shape) not in (2, 3) or min(shape) < 1:
-            raise ValueError(f"frames of {shape} {dtype} cannot be recorded; (H, W[, C]) u8 or u16")
-        self.shape = shape
-        self.dtype = np.dtype(dtype.name)
-        self.frame_bytes = math.prod(shape) * dtype.itemsize
-        height = shape[0]
-        self.rows = math.ceil(height / math.ceil(self.frame_bytes / _BAND))
-        self.bands = math.ceil(height / self.rows)
-        band = self.rows * (self.frame_bytes // height)
-        index = b"".join(struct.pack("<QQ", i * band, band) for i in range(self.bands))
-        padding = bytes(self.bands * band - self.frame_bytes)
-        self.tail = padding + index + struct.pack("<I", _crc32c(index))
-        self.shard_bytes = self.frame_bytes + len(self.tail)
-        self.suffix = ".0" * len(shape)
-
-    @classmethod
-    def read(cls, path: Path) -> _Layout:
-        """Of an existing array. Raises Damaged when the array is not one that Umbra wrote."""
-        with storage(f"opening {path.name}"):
-            text = (path / "zarr.json").read_bytes()
-        try:
-            found = msgspec.json.decode(text)
-            layout = cls(tuple(found["shape"][1:]), np.dtype(found["data_type"]))
-            same = msgspec.json.decode(layout.metadata(found["shape"][0])) == found
-        except (msgspec.DecodeError, LookupError, TypeError, ValueError) as error:
-            raise Damaged(f"{path / 'zarr.json'} is damaged ({error})") from error
-        if not same:
-            raise Damaged(f"{path / 'zarr.json'} is not as Umbra wrote it; restore it from a copy")
-        return layout
-
-    def check(self, pixels: NDArray[Any]) -> None:
-        """Raises ValueError for an array that is not one of these frames."""
-        if pixels.shape != self.shape or pixels.dtype != self.dtype:
-            raise ValueError(
-                f"a frame of {pixels.shape} {pixels.dtype}, in a run of {self.shape} {self.dtype}"
-            )
-
-    def metadata(self, frames: int) -> bytes:
-        """zarr.json of an array of so many frames."""
-        _, *rest = self.shape
-        padded = self.rows * self.bands
-        little = {"name": "bytes", "configuration": {"endian": "little"}}
-        document = {
-            "zarr_format": 3,
-            "node_type": "array",
-            "shape": [frames, *self.shape],
-            "data_type": self.dtype.name,
-            "chunk_grid": {
-                "name": "regular",
-                "configuration": {"chunk_shape": [1, padded, *rest]},
-            },
-            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},
-            "fill_value": 0,
-            "codecs": [
-                {
-                    "name": "sharding_indexed",
-                    "configuration": {
-                        "chunk_shape": [1, self.rows, *rest],
-                        "codecs": [little],
-                        "index_codecs": [little, {"name": "crc32c"}],
-                        "index_location": "end",
-                    },
-                }
-            ],
-            "attributes": {},
-            "dimension_names": ["frame", "y", "x", "c"][: 1 + len(self.shape)],
-        }
-        return msgspec.json.format(msgspec.json.encode(document))
 
 
 def _damaged(index: int, path: Path) -> Damaged:
@@ -385,16 +302,6 @@ def _write(path: Path, parts: list[memoryview | bytes]) -> None:
     except OSError:
         path.unlink(missing_ok=True)
         raise
-
-
-def _crc32c(data: bytes) -> int:
-    """CRC-32C (Castagnoli), bit by bit: done once a run, over an index of a few hundred bytes."""
-    crc = 0xFFFFFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc >> 1) ^ (0x82F63B78 if crc & 1 else 0)
-    return crc ^ 0xFFFFFFFF
 
 
 def count(folder: Path) -> tuple[int, int]:

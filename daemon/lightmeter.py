@@ -12,19 +12,20 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from daemon.devicethread import Session
-from daemon.metering import Exposure, Level, Limits, choose, level_of
 from daemon.patterns import render
 from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench, Unsuitable
+from daemon.separation.exposure import LONGEST_US, Limits
+from daemon.separation.metering import Exposure, Level, choose, level_of
 from daemon.separation.radiometry import Response
 from daemon.snapshot import snap_whole
-from drivers.base import CameraInfo, CameraSettings, Frame
+from drivers.base.camera import CameraInfo, CameraSettings, Frame
 from drivers.clock import NS
 from protocol.patterns import WHITE
-from protocol.scans import CalibrateDark, OccluderScan, Spec
+from protocol.scans.calibrations import CalibrateDark
+from protocol.scans.occluded import OccluderScan
+from protocol.scans.spec import Spec
 
-LONGEST_US = 1e6
-"""Auto-exposure goes no further unless the spec's own exposure allows it."""
 _SHOW_S = 5.0
 _LIGHT_S = 5.0
 
@@ -88,7 +89,7 @@ class LightMeter:
             return self._picture(self._settings)
 
     def choose(self) -> Exposure:
-        """The exposure for this light; see `daemon.metering.choose`. Raises DeviceError."""
+        """The exposure for this light, as `metering.choose` finds it. Raises DeviceError."""
         start = self._rig.camera.device.settings().exposure_us or LONGEST_US / 100
         with self._full_light():
             return choose(

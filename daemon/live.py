@@ -24,7 +24,8 @@ from daemon.rig import Rig
 from daemon.scans.single_image import SingleImageMethod
 from daemon.separation.estimator import Components, Lighting, Observation
 from daemon.viewfinder import WIDTH, Glimpse, Viewfinder, saturation_of
-from drivers.base import Acquisition, Camera, CameraInfo, DeviceError, Frame
+from drivers.base.camera import Acquisition, Camera, CameraInfo, Frame
+from drivers.base.errors import DeviceError
 
 SHARE = 0.25
 """Of one processor's time, at most."""

@@ -18,22 +18,25 @@ import structlog
 
 from daemon.devicethread import Session
 from daemon.exposing.apparatus import CALL_S, SHOW_S
-from daemon.lightmeter import LONGEST_US, limits_of
+from daemon.lightmeter import limits_of
 from daemon.live import Live
 from daemon.manualstage import ManualStage
-from daemon.metering import Exposure, Level, choose, level_of
 from daemon.patterns import render
 from daemon.rig import SAFE_S, Rig
 from daemon.scans.method import Bench
 from daemon.scans.single_image import SingleImageMethod
+from daemon.separation.exposure import LONGEST_US
+from daemon.separation.metering import Exposure, Level, choose, level_of
 from daemon.separation.radiometry import Response
 from daemon.snapshot import snap, snap_whole
 from daemon.viewfinder import Viewfinder
-from drivers.base import Camera, CameraInfo, CameraSettings, DeviceError, Frame
+from drivers.base.camera import Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, LockInfo
+from protocol.messages.events import AnyEvent
+from protocol.messages.rig import LockInfo
 from protocol.patterns import AnyPattern, Stripes
-from protocol.scans import SingleImage
+from protocol.scans.projected import SingleImage
 
 _OFF_S = 2.0
 _LIGHT_S = 600.0
@@ -278,7 +281,7 @@ class Manual:
 
     def expose(self, wanted: CameraSettings, response: Response) -> Exposure:
         """Choose the exposure for the scene as it is lit now; that of `wanted` is the longest, the
-        rest is set. See `daemon.metering.choose`. Raises UmbraError, DeviceError."""
+        rest is set. See `daemon.separation.metering.choose`. Raises UmbraError, DeviceError."""
         camera = self._rig.camera
         start = camera.device.settings().exposure_us or LONGEST_US / 100
 

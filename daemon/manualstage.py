@@ -1,10 +1,13 @@
 """The stage moved by hand: homing and motions that answer at once and are followed to their end.
 
     resting ──home, move, circle──> going ──done, stop, failure──> resting
+                                    going ──move, circle, home──> going (stopped in between)
 
 Whoever asked has the answer when the stage has accepted; a thread then keeps the planner full,
-publishes `stage-changed`, and keeps manual work alive until the stage rests. A circle without an
-end goes on for `ENDLESS_S`, or for as long as its owner holds the rig.
+publishes `stage-changed`, and keeps manual work alive until the stage rests. There is one such
+thread at a time: whoever asks for something else ends it first, and with it the motion; homing is
+ended by `stop` only. A circle without an end goes on for `ENDLESS_S`, or for as long as its owner
+holds the rig.
 """
 
 from __future__ import annotations
@@ -15,16 +18,20 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from concurrent.futures import TimeoutError as FutureTimeout
+from dataclasses import dataclass, field
 
 import structlog
 
 from daemon.devicethread import DeviceThread, Revoked, Session
 from daemon.rig import Rig
-from drivers.base import DeviceError, Stage
-from drivers.base import StageState as DriverState
-from drivers.base import StageStatus as DriverStatus
+from drivers.base.errors import DeviceError
+from drivers.base.stage import Stage
+from drivers.base.stage import StageState as DriverState
+from drivers.base.stage import StageStatus as DriverStatus
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, StageChanged, StageState, StageStatus
+from protocol.messages.events import AnyEvent, StageChanged
+from protocol.messages.replies import StageStatus
+from protocol.messages.rig import StageState
 
 CALL_S = 5.0
 """Deadline of a call that does not wait for the motion's end."""
@@ -34,8 +41,29 @@ _PUMP_S = 0.05
 _TELL_S = 0.25
 _LEASE_S = 2.0
 _FINISH_S = 30.0
+_HALT_EVERY_S = 0.25
 
 log = structlog.get_logger(__name__)
+
+
+@dataclass
+class _Motion:
+    """One homing (then `homing` is its call) or motion, and the thread that follows it."""
+
+    session: Session
+    homing: Future[None] | None = None
+    endless: bool = False
+    replaced: threading.Event = field(default_factory=threading.Event)
+    follower: threading.Thread | None = None
+
+    @property
+    def going(self) -> bool:
+        return self.follower is not None and self.follower.is_alive()
+
+    def join(self, seconds: float | None) -> None:
+        """Wait for its end."""
+        if self.follower is not None:
+            self.follower.join(seconds)
 
 
 class ManualStage:
@@ -53,10 +81,8 @@ class ManualStage:
         self._use = use
         self._keep = keep
         self._publish = publish
-        self._mutex = threading.Lock()
-        self._follower: threading.Thread | None = None
-        self._homing = False
-        self._endless = False
+        self._mutex = threading.Lock()  # one asks for a motion at a time; stop waits for nobody
+        self._motion: _Motion | None = None  # the last
         self._problem = ""  # of the last motion
 
     @property
@@ -69,15 +95,21 @@ class ManualStage:
     @property
     def going(self) -> bool:
         """Whether a motion is being followed."""
-        follower = self._follower
-        return follower is not None and follower.is_alive()
+        return self._motion is not None and self._motion.going
+
+    @property
+    def _homing(self) -> Future[None] | None:
+        """The homing under way."""
+        motion = self._motion
+        homing = motion.homing if motion is not None and motion.going else None
+        return None if homing is None or homing.done() else homing
 
     # ------------------------------------------------------------ asked for
 
     def status(self) -> StageStatus:
         """Where it is, without disturbing whoever moves it. Raises UmbraError, DeviceError."""
         thread = self._thread
-        if self._homing:  # its thread waits for the switches, and the controller is silent
+        if self._homing is not None:  # its thread waits, and the controller is silent
             return self._as_reply(StageState.HOMING, None, "")
         try:
             # not `call`: a question that comes too late must not halt a scan's motion
@@ -92,11 +124,12 @@ class ManualStage:
         """Begin to look for the origin. Raises UmbraError(busy), DeviceError."""
         thread = self._thread
         with self._mutex:
-            self._require_rest()
+            self._require_not_homing()
             session = self._use(_LEASE_S)
-            self._homing, self._endless, self._problem = True, False, ""
+            self._take_over()
+            self._problem = ""
             homing = thread.submit(lambda s: s.home(timeout_s), timeout_s + CALL_S, session)
-            self._follow(session, homing, timeout_s)
+            self._follow(_Motion(session, homing=homing), timeout_s)
         return self._as_reply(StageState.HOMING, None, "")
 
     def move(self, x_mm: float, y_mm: float, feed_mm_s: float) -> StageStatus:
@@ -120,79 +153,91 @@ class ManualStage:
         """End every motion, homing too. Raises UmbraError, DeviceError."""
         thread = self._thread
         session = self._use(_LEASE_S)
-        if self._homing:
-            thread.device.halt()
+        self._end_homing()
         thread.call(lambda s: s.stop(), CALL_S, session)
-        self._join(CALL_S)
+        if self._motion is not None:
+            self._motion.join(CALL_S)
         return self.status()
 
     def unlock(self) -> StageStatus:
         """Leave the alarm; the position stays unknown. Raises UmbraError, DeviceError."""
-        self._require_rest()
+        self._require_not_homing()
         self._problem = ""
         self._thread.call(lambda s: s.unlock(), CALL_S, self._use(_LEASE_S))
         return self.status()
 
     def finish(self) -> None:
         """Before a scan: wait for the end of homing and of a short motion; stop any other."""
-        if self.going and not self._endless:
-            self._join(None if self._homing else _FINISH_S)
+        motion = self._motion
+        if motion is not None and not motion.endless:
+            motion.join(None if motion.homing is not None else _FINISH_S)
         if self.going:
             self.stop()
 
     # ------------------------------------------------------------ the motion
 
-    def _require_rest(self) -> None:
-        if self.going and self._homing:
+    def _require_not_homing(self) -> None:
+        if self._homing is not None:
             raise UmbraError(
                 Code.BUSY, "the stage is homing: wait for its end, or `umbra stage stop`"
             )
 
+    def _take_over(self) -> None:
+        """Follow the motion under way no more: its pumping would wait behind what comes now, and
+        a call that is late halts the stage."""
+        if self._motion is not None:
+            self._motion.replaced.set()
+            self._motion.join(CALL_S + _ASK_S)
+
+    def _end_homing(self) -> None:
+        """Halt it until it has ended: a halt that comes before the driver has begun is lost."""
+        homing, deadline = self._homing, time.monotonic() + CALL_S
+        while homing is not None and not homing.done() and time.monotonic() < deadline:
+            self._thread.device.halt()
+            wait([homing], _HALT_EVERY_S)
+
     def _go(self, act: Callable[[Stage], None], *, endless: bool) -> StageStatus:
         thread = self._thread
         with self._mutex:
-            self._require_rest()
+            self._require_not_homing()
             session = self._use(ENDLESS_S if endless else _LEASE_S)
+            self._take_over()
 
             def go(stage: Stage) -> None:
-                if not self.going and stage.status().state is DriverState.HELD:
-                    stage.stop()  # what a safe state interrupted is nobody's wish any more
+                # held is what a safe state interrupted: nobody's wish any more
+                if stage.status().state in {DriverState.MOVING, DriverState.HELD}:
+                    stage.stop()
                 act(stage)
 
-            thread.call(go, CALL_S, session)
-            self._endless, self._problem = endless, ""
-            if not self.going:
-                self._follow(session, None, 0.0)
+            self._problem = ""
+            try:
+                thread.call(go, CALL_S, session)
+            finally:  # refused or not, what moves is followed until it rests
+                self._follow(_Motion(session, endless=endless), 0.0)
         return self.status()
 
-    def _follow(self, session: Session, homing: Future[None] | None, timeout_s: float) -> None:
-        self._follower = threading.Thread(
-            target=self._until_rest, args=(session, homing, timeout_s), name="umbra-stage-by-hand"
+    def _follow(self, motion: _Motion, timeout_s: float) -> None:
+        motion.follower = threading.Thread(
+            target=self._until_rest, args=(motion, timeout_s), name="umbra-stage-by-hand"
         )
-        self._follower.start()
+        self._motion = motion
+        motion.follower.start()
 
-    def _join(self, seconds: float | None) -> None:
-        follower = self._follower
-        if follower is not None:
-            follower.join(seconds)
-
-    def _until_rest(self, session: Session, homing: Future[None] | None, timeout_s: float) -> None:
+    def _until_rest(self, motion: _Motion, timeout_s: float) -> None:
         thread = self._thread
         try:
-            if homing is not None:
+            if motion.homing is not None:
                 self._tell(StageState.HOMING, None, "")
-                self._await(homing, session, timeout_s + CALL_S)
-                thread.wait(homing, 0.0)
-                self._homing = False
-            self._pump(thread, session)
+                self._await(motion.homing, motion.session, timeout_s + CALL_S)
+                thread.wait(motion.homing, 0.0)
+            self._pump(thread, motion)
         except DeviceError as error:
             self._problem = str(error)
             log.warning("stage by hand", problem=self._problem)
             self._rig.failed(error)
         except Revoked:
             log.info("stage by hand ended with manual work")
-        finally:
-            self._homing = False
+        if not motion.replaced.is_set():
             self._told_at_rest(thread)
 
     def _await(self, homing: Future[None], session: Session, seconds: float) -> None:
@@ -202,13 +247,13 @@ class ManualStage:
             self._keep(session, _LEASE_S)
             wait([homing], _LEASE_S / 2)
 
-    def _pump(self, thread: DeviceThread[Stage], session: Session) -> None:
-        tell_at = 0.0
-        while True:
+    def _pump(self, thread: DeviceThread[Stage], motion: _Motion) -> None:
+        session, tell_at = motion.session, 0.0
+        while not motion.replaced.is_set():
             now: DriverStatus = thread.call(lambda s: s.pump(), CALL_S, session)
             if now.state is not DriverState.MOVING:
                 return
-            if not self._endless:
+            if not motion.endless:
                 self._keep(session, _LEASE_S)
             if time.monotonic() >= tell_at:
                 tell_at = time.monotonic() + _TELL_S

@@ -18,7 +18,8 @@ import structlog
 
 from daemon.devicethread import DeviceThread, Revoked, Session
 from daemon.scans.method import Circle, Motion
-from drivers.base import DeviceError, DeviceRefused, Stage, StageState, StageStatus
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.stage import Stage, StageState, StageStatus
 
 CALL_S = 5.0
 """Deadline of a call that does not wait for the motion's end."""

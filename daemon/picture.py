@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from daemon.display import common_white, fit, for_display
 from daemon.separation.mosaic import demosaic
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 
 Picture = NDArray[np.uint8]
 

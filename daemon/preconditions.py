@@ -21,12 +21,12 @@ import structlog
 from daemon.control import Control
 from daemon.devicethread import Session
 from daemon.failures import as_error
-from daemon.metering import Level
-from drivers.base import DeviceError
+from daemon.separation.metering import Level
+from drivers.base.errors import DeviceError
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
-from protocol.messages import Waiting
-from protocol.scans import Ready
+from protocol.messages.runs import Waiting
+from protocol.scans.spec import Ready
 
 _MENDS = {
     Code.DEVICE_LOST,
@@ -134,7 +134,7 @@ class LightWatch:
     """Looks at the light, no more often than `look_s`, and what they say of it."""
 
     def __init__(self, wanted: Ready, look: Callable[[], Level], clock: Clock) -> None:
-        """`look` takes a picture; see `daemon.metering`."""
+        """`look` takes a picture; see `daemon.separation.metering`."""
         self._wanted = wanted
         self._look = look
         self._clock = clock

@@ -21,19 +21,23 @@ from daemon.control import Control
 from daemon.devicethread import Session
 from daemon.exposing.apparatus import CALL_S
 from daemon.lightmeter import LightMeter, require_meterable
-from daemon.metering import Exposure, Level
 from daemon.motion import require_homed
 from daemon.preconditions import LightWatch, Precondition, Preconditions
 from daemon.rig import Rig
+from daemon.runfolder import RunFolder
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Method
 from daemon.scans.pattern_scan import response_of
-from daemon.store import RunFolder, Store, estimate_bytes
+from daemon.separation.metering import Exposure, Level
+from daemon.store import Store, estimate_bytes
 from daemon.viewfinder import Viewfinder
-from drivers.base import CameraSettings, DeviceError
+from drivers.base.camera import CameraSettings
+from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
-from protocol.messages import Waiting
-from protocol.scans import AnyScan, OccluderScan, Radiometry, Scan
+from protocol.messages.runs import Waiting
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import OccluderScan
+from protocol.scans.spec import Radiometry, Scan
 
 log = structlog.get_logger(__name__)
 

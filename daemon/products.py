@@ -25,20 +25,21 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon import measured, report
+from daemon import measured
 from daemon.display import Picture, common_white, for_display, frame_light
 from daemon.durable import Damaged
 from daemon.frames import FrameRecord, FrameStore, NoPixels
 from daemon.preview import side_by_side
 from daemon.quality import BITS, overlay
+from daemon.report.separation import Subject, render
+from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Components, Lighting, Measurement, Result
 from daemon.separation.single import block_mean
 from daemon.staging import Staging, as_json, encoded, tiff
-from daemon.store import RunFolder
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
-from protocol.messages import Product
-from protocol.scans import Scan
+from protocol.messages.runs import Product
+from protocol.scans.spec import Scan
 
 PREVIEW_WIDTH = 640
 REPORT_WIDTH = 1440
@@ -95,8 +96,8 @@ def write(
         staging.add("facts", "facts", "quality.json", as_json(facts))
         preview = side_by_side({name: for_preview(picture) for name, picture in found.items()})
         staging.add("preview", "picture", "preview.png", encoded(".png", preview[..., ::-1]))
-        page = report.render(
-            report.Subject(
+        page = render(
+            Subject(
                 file=file,
                 facts=facts,
                 pictures=found,

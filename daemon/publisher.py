@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from daemon.ending import utc_now
 from protocol import wire
-from protocol.messages import AnyEvent, Event
+from protocol.messages.envelopes import Event
+from protocol.messages.events import AnyEvent
 
 HIGH_WATER = 200
 """Events that may wait for one subscriber; beyond that it misses some, and sees it by the gap."""

@@ -38,9 +38,15 @@ class Bit:
 # In the order in which they are painted: the worse over the milder.
 BITS: tuple[Bit, ...] = (
     Bit(
+        Quality.EDGE,
+        "An edge of the pattern lay here: the light is split as that of the pixels around.",
+        "Natural in two images and random phases. A checkerboard's shifts show every pixel whole; "
+        "larger checkers or patches have fewer edges.",
+        (178, 190, 195),
+    ),
+    Bit(
         Quality.LOW_MODULATION,
-        "Direct light is not told from noise here, or (two images) is too small, at the edge of a "
-        "checker.",
+        "Direct light is not told from noise here.",
         "Natural in shadow and in pure interreflection. Elsewhere: average more frames, expose "
         "longer, or focus the projector.",
         (86, 180, 233),

@@ -31,7 +31,7 @@ from daemon.frames import FrameRecord, FrameStore
 from daemon.ring import Buffer, Ring
 from daemon.scans.method import Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, NotYet, Result
-from drivers.base import Frame
+from drivers.base.camera import Frame
 from drivers.clock import NS
 from protocol.errors import Code
 

@@ -29,14 +29,16 @@ from daemon.failures import as_error
 from daemon.frames import ARRAY, LINES, FrameRecord, FrameStore
 from daemon.preparation import as_exposed
 from daemon.recorder import Tally
+from daemon.runfolder import RunFile, RunFolder
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Circle, Expose, Method, Step, Taken, Unsuitable, Watch
 from daemon.scans.occluder import INCOMPLETE
 from daemon.separation.estimator import Components, NotYet, Result
-from daemon.store import RunFile, RunFolder, Store, estimate_bytes
+from daemon.store import Store, estimate_bytes
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Progress, RunState
-from protocol.scans import AnyScan, Mesh
+from protocol.messages.runs import End, Progress, RunState
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import Mesh
 
 _PROGRESS_S = 0.1
 _RATE_FRAMES = 20

@@ -21,10 +21,13 @@ from daemon.config import RigConfig
 from daemon.ending import utc_now
 from daemon.failures import as_error
 from daemon.reprocessing import Reprocessing, method_of, source_of
+from daemon.runfolder import RunFile, RunFolder
 from daemon.scans.method import Unsuitable
-from daemon.store import RunFile, RunFolder, Store
+from daemon.store import Store
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, End, Progress, Progressed, Reprocess, RunChanged, RunState
+from protocol.messages.commands import Reprocess
+from protocol.messages.events import AnyEvent, Progressed, RunChanged
+from protocol.messages.runs import End, Progress, RunState
 from protocol.reading import changed
 
 _RESUMABLE_CODES = {Code.STORAGE_FULL, Code.STORAGE_FAILED}

@@ -15,20 +15,15 @@ from daemon.config import RigConfig
 from daemon.devicethread import DeviceThread, Revoked, Session
 from daemon.scans.method import Bench
 from drivers import registry
-from drivers.base import (
-    Camera,
-    Context,
-    Device,
-    DeviceError,
-    DeviceLost,
-    Identity,
-    Light,
-    Projector,
-    Stage,
-)
+from drivers.base.camera import Camera
+from drivers.base.device import Context, Device, Identity
+from drivers.base.errors import DeviceError, DeviceLost
+from drivers.base.light import Light
+from drivers.base.projector import Projector
+from drivers.base.stage import Stage
 from drivers.clock import Clock, RealClock, ScaledClock
 from protocol.errors import Code, UmbraError
-from protocol.messages import DeviceInfo, Health
+from protocol.messages.rig import DeviceInfo, Health
 
 CONNECT_S = 20.0
 """Deadline of a connect: the slowest is a camera's SDK that enumerates."""

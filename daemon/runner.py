@@ -21,22 +21,16 @@ from daemon.failures import as_error
 from daemon.frames import count
 from daemon.lightmeter import require_meterable
 from daemon.rig import Rig
+from daemon.runfolder import RunFolder
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Unsuitable
-from daemon.store import RunFolder, Store
+from daemon.store import Store
 from daemon.viewfinder import Viewfinder
-from drivers.base import DeviceError
+from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
-from protocol.messages import (
-    AnyEvent,
-    End,
-    Progress,
-    Progressed,
-    QueueChanged,
-    RunChanged,
-    RunState,
-)
-from protocol.scans import AnyScan
+from protocol.messages.events import AnyEvent, Progressed, QueueChanged, RunChanged
+from protocol.messages.runs import End, Progress, RunState
+from protocol.scans.anyscan import AnyScan
 
 _UNFINISHED = {RunState.WAITING, RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}
 _RESUMABLE_CODES = {

@@ -17,7 +17,7 @@ from daemon.exposing.stepped import Stepped
 from daemon.exposing.streamed import Streamed
 from daemon.exposing.video import Video
 from daemon.scans.method import Digest, Expose, Watch
-from drivers.base import DeviceError
+from drivers.base.errors import DeviceError
 
 
 def exposer_for(choice: Choice, apparatus: Apparatus) -> Exposer:

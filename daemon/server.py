@@ -23,15 +23,10 @@ from numpy.typing import NDArray
 from daemon.failures import as_error
 from protocol import wire
 from protocol.errors import Code, UmbraError
-from protocol.messages import (
-    PROTOCOL,
-    AnyCommand,
-    AnyReply,
-    Preamble,
-    Request,
-    Response,
-    Role,
-)
+from protocol.messages.access import Role
+from protocol.messages.commands import AnyCommand
+from protocol.messages.envelopes import PROTOCOL, Preamble, Request, Response
+from protocol.messages.replies import AnyReply
 
 _REMEMBERED = 1024
 _REMEMBERED_BYTES = 64 << 20

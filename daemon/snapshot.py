@@ -6,17 +6,8 @@ import numpy as np
 import structlog
 
 from daemon.devicethread import DeviceThread, Session, Stuck
-from drivers.base import (
-    Acquisition,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    DeviceError,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceTimeout,
-    Frame,
-)
+from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceTimeout
 from drivers.clock import Clock
 
 _PATIENCE_S = 2.0

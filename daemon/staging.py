@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.durable import fsync_file, fsync_folder, storage
-from protocol.messages import Product
+from protocol.messages.runs import Product
 
 _STAGING = ".products-"
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from daemon.durable import StorageError
 from daemon.recorder import Recorder, Tally
+from daemon.runfolder import RunFolder
 from daemon.scans.method import Method
-from daemon.store import RunFolder
 from drivers.clock import NS, Clock
 from protocol.errors import Code
-from protocol.messages import Progress, RunState, Waiting
+from protocol.messages.runs import Progress, RunState, Waiting
 
 _PROGRESS_S = 0.1
 _RATE_FRAMES = 20

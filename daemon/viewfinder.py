@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.display import thumbnail
-from drivers.base import CameraInfo, Frame
+from drivers.base.camera import CameraInfo, Frame
 
 _EVERY_S = 0.25
 WIDTH = 640

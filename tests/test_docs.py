@@ -14,8 +14,8 @@ from typer.main import get_command
 
 from daemon import config
 from daemon.frames import FrameRecord
+from daemon.runfolder import RunFile
 from daemon.separation.estimator import Quality
-from daemon.store import RunFile
 from drivers import registry
 from protocol.cli.app import app
 

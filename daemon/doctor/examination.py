@@ -26,9 +26,11 @@ from daemon.doctor.verdict import failed, skipped
 from daemon.manual import Manual
 from daemon.rig import Rig
 from daemon.store import Store
-from drivers.base import CameraInfo, DeviceError
+from drivers.base.camera import CameraInfo
+from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
-from protocol.messages import Check, Health
+from protocol.messages.findings import Check
+from protocol.messages.rig import Health
 
 _LEASE_S = 120.0
 

@@ -25,7 +25,7 @@ from daemon.recorder import Exposed, Recorder
 from daemon.rig import SAFE_S, Rig
 from daemon.ring import Buffer, Ring
 from daemon.scans.method import Expose, Method, Step
-from drivers.base import Acquisition, Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
 from drivers.clock import NS
 from protocol.patterns import AnyPattern
 

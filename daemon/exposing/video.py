@@ -10,13 +10,8 @@ from daemon.exposing.apparatus import CALL_S, Apparatus
 from daemon.motion import Mover
 from daemon.ring import Buffer
 from daemon.scans.method import Watch
-from drivers.base import (
-    Acquisition,
-    DeviceGarbled,
-    DeviceTimeout,
-    EndOfRecording,
-    Frame,
-)
+from drivers.base.camera import Acquisition, Frame
+from drivers.base.errors import DeviceGarbled, DeviceTimeout, EndOfRecording
 from drivers.clock import NS
 
 WAY = "video"

@@ -15,9 +15,11 @@ import msgspec
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation
-from drivers.base import CameraInfo, ProjectorInfo, StageInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.projector import ProjectorInfo
+from drivers.base.stage import StageInfo
 from protocol.patterns import AnyPattern
-from protocol.scans import Spec
+from protocol.scans.spec import Spec
 
 S = TypeVar("S", bound=Spec)
 

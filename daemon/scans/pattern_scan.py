@@ -23,7 +23,8 @@ from daemon.separation.noise import Noise
 from daemon.separation.order_estimate import KEEP, RANKS
 from daemon.separation.radiometry import Response
 from protocol.patterns import BLACK, WHITE, AnyPattern
-from protocol.scans import PatternScan, Radiometry, Reference
+from protocol.scans.projected import PatternScan
+from protocol.scans.spec import Radiometry, Reference
 
 FINE_PX = 64
 """Patterns of larger checkers, patches or periods may light one end of a scene alone."""

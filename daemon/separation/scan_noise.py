@@ -20,6 +20,7 @@ from daemon.separation.radiometry import Plane, Response
 _SAMPLE = 4
 _ENOUGH = 100  # samples that make a level's deviation
 _LEVELS = 24
+_MORE = 3.0  # times what a picture shows, an upper bound of noise: that is none
 
 
 def _pictured(response: Response, pixels: NDArray[Any]) -> Noise:
@@ -81,11 +82,14 @@ class ScanNoise:
 
         A calibration is believed unless the scan's own frames contradict it.
         """
+        picture = self._picture
+        if residual is not None and picture is not None and residual.over(picture) > _MORE:
+            residual = None  # the light has not the order that it was said to have
         for found, source in ((self._repeats.noise(), REPEATS), (residual, RESIDUALS)):
             if found is not None:
                 return told(self._response, found, source, [found], self._average, sure=True)
-        bounds = [] if self._picture is None else [self._picture]
-        return told(self._response, self._picture, PICTURE, bounds, self._average)
+        bounds = [] if picture is None else [picture]
+        return told(self._response, picture, PICTURE, bounds, self._average)
 
 
 REPEATS, PICTURE = "repeated frames", "one picture"

@@ -10,9 +10,10 @@ import pytest
 import structlog.testing
 
 from daemon import aftermath, config
-from daemon.store import RunFolder, Store
-from protocol.messages import End, RunState
-from protocol.scans import TwoImage
+from daemon.runfolder import RunFolder
+from daemon.store import Store
+from protocol.messages.runs import End, RunState
+from protocol.scans.projected import TwoImage
 
 RIG = """
 camera = {{driver = "virtual"}}

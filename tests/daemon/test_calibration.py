@@ -11,17 +11,18 @@ import pytest
 
 from daemon import measured
 from daemon.calibration import Calibrations
+from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Measurement
-from daemon.store import RunFolder, Store
-from protocol.messages import RunState
-from protocol.scans import (
-    AnyScan,
+from daemon.store import Store
+from protocol.messages.runs import RunState
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.calibrations import (
     CalibrateDark,
     CalibrateLatency,
     CalibrateLeak,
     CalibrateTone,
-    Checkerboard,
 )
+from protocol.scans.projected import Checkerboard
 
 RIG: dict[str, Any] = {
     "camera": {"driver": "virtual", "model": "C", "serial": "1"},

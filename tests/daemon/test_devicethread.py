@@ -8,7 +8,9 @@ from collections.abc import Iterator
 import pytest
 
 from daemon.devicethread import DeviceThread, Revoked, Session, Stuck
-from drivers.base import Context, DeviceGarbled, DeviceLost, Identity, Light, Options
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceGarbled, DeviceLost
+from drivers.base.light import Light
 
 
 class Lamp(Light):

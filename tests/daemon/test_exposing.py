@@ -28,10 +28,11 @@ from daemon.scans.catalog import method_for
 from daemon.scans.method import Circle, Method, Unsuitable, Watch
 from daemon.scans.pattern_scan import response_of
 from daemon.sequencer import Sequencer, exposer_for
-from drivers.base import CameraSettings
+from drivers.base.camera import CameraSettings
 from drivers.clock import NS, Clock
-from protocol.messages import RunState
-from protocol.scans import Radiometry, TwoImage
+from protocol.messages.runs import RunState
+from protocol.scans.projected import TwoImage
+from protocol.scans.spec import Radiometry
 
 RIG = """
 [rig]

@@ -14,9 +14,9 @@ from daemon.rig import Rig
 from daemon.scans.pattern_scan import response_of
 from daemon.snapshot import snap
 from daemon.viewfinder import Viewfinder
-from drivers.base import CameraSettings
+from drivers.base.camera import CameraSettings
 from protocol.patterns import WHITE
-from protocol.scans import Radiometry
+from protocol.scans.spec import Radiometry
 
 RIG = """
 [rig]

@@ -14,9 +14,10 @@ import pytest
 
 from daemon import measured
 from daemon.plot import as_csv, as_svg
+from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Curve, Measurement, Plot
-from daemon.store import RunFolder, Store
-from protocol.scans import CalibrateLeak
+from daemon.store import Store
+from protocol.scans.calibrations import CalibrateLeak
 
 X = np.asarray([1.0, 2.0, 4.0, 8.0])
 PLOT = Plot(

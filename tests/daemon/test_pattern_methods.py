@@ -7,19 +7,19 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Components, Quality
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 from protocol.patterns import Axis
-from protocol.scans import (
-    AnyScan,
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Radiometry,
     RandomBinary,
     RandomPhase,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import FULL, Scene
 
 LEAK = 0.06

@@ -9,13 +9,13 @@ import pytest
 
 from daemon.control import Control
 from daemon.devicethread import Revoked, Session
-from daemon.metering import Level
 from daemon.preconditions import LightWatch, Precondition, Preconditions
-from drivers.base import DeviceError, DeviceLost, DeviceRefused
+from daemon.separation.metering import Level
+from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunState, Waiting
-from protocol.scans import Ready
+from protocol.messages.runs import RunState, Waiting
+from protocol.scans.spec import Ready
 
 
 class JumpingClock(Clock):

@@ -13,11 +13,12 @@ from daemon.display import UNMEASURED, common_white, for_display, thumbnail
 from daemon.durable import Damaged, StorageError
 from daemon.frames import FrameRecord, FrameStore
 from daemon.quality import BITS, overlay
+from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Components, Observation, Quality
-from daemon.store import RunFolder, Store
-from drivers.base import PixelFormat
+from daemon.store import Store
+from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 
 SIZE = (24, 32)
 

@@ -18,8 +18,10 @@ from daemon.ring import Ring
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
 from daemon.separation.estimator import NotYet
-from drivers.base import CameraInfo, Frame, PixelFormat, ProjectorInfo
-from protocol.scans import TwoImage
+from drivers.base.camera import CameraInfo, Frame
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
+from protocol.scans.projected import TwoImage
 
 SHAPE = (12, 16)
 CAMERA = CameraInfo(SHAPE[1], SHAPE[0], PixelFormat.MONO8)

@@ -9,12 +9,14 @@ import pytest
 
 from daemon.durable import Damaged
 from daemon.frames import FrameRecord, FrameStore
+from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Observation
-from daemon.store import DataFolderInUse, RunFolder, Store, estimate_bytes
+from daemon.store import DataFolderInUse, Store, estimate_bytes
 from drivers.clock import RealClock
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Product, RunState
-from protocol.scans import Checkerboard, Stick, TwoImage
+from protocol.messages.runs import End, Product, RunState
+from protocol.scans.occluded import Stick
+from protocol.scans.projected import Checkerboard, TwoImage
 
 
 class Calendar(RealClock):

@@ -10,7 +10,9 @@ from daemon.separation.extremes import Extremes
 from daemon.separation.order_estimate import KEEP
 from daemon.separation.order_model import BLURS, RATIOS, OrderModels
 from daemon.separation.radiometry import Response
-from protocol.scans import AnyScan, Checkerboard, Radiometry, RandomBinary
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import Checkerboard, RandomBinary
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import FULL, Scene
 
 NONE: tuple[()] = ()

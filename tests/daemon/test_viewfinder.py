@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.viewfinder import Glimpse, Viewfinder, cells, saturation_of
-from drivers.base import CameraInfo, Frame, PixelFormat
+from drivers.base.camera import CameraInfo, Frame
+from drivers.base.pixelformat import PixelFormat
 
 
 def frame(pixels: NDArray[Any]) -> Frame:

@@ -123,7 +123,10 @@ def test_demo(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [*UMBRA, "demo", "-o", "out"], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+        [*UMBRA, "demo", "-o", "out", "--speed", "0.2"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert process.stderr is not None
     for line in process.stderr:
@@ -291,3 +294,31 @@ def test_a_stray_module_in_the_users_folder_does_no_harm(tmp_path: Path) -> None
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_photographs_of_exported_patterns_are_separated_by_the_command_that_is_told(
+    tmp_path: Path,
+) -> None:
+    size = f"{SIZE[1]}x{SIZE[0]}"
+    options = ("-m", "sinusoid", "--phases", "4", "--periods", "8", "--size", size)
+    done = umbra("patterns", *options, "--json", "-o", "patterns", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    direct, smooth = scene()
+    (tmp_path / "photos").mkdir()
+    taken = {"black.png": tmp_path / "black.png", "white.png": tmp_path / "white.png"}
+    for file in map(Path, told["files"]):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert image is not None
+        levels = image[..., None] / 255.0
+        seen = direct * levels + smooth * levels.mean()
+        photograph = taken.get(file.name, tmp_path / "photos" / file.name)
+        cv2.imwrite(str(photograph), np.rint(16 * seen[..., ::-1]).astype(np.uint16))
+    named = {"PHOTOS": "photos", "BLACK": "black.png", "WHITE": "white.png", "OUT": "out"}
+    words = [named.get(word, word) for word in told["command"].split()]
+    done = umbra(*words[1:], "--depth", "12", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = read(tmp_path / "out" / "direct.tiff")
+    np.testing.assert_allclose(found, 16 * direct, atol=20)
+    assert json.loads((tmp_path / "out" / "quality.json").read_text())["full_scale"] == 4095
+    assert_no_orphan(tmp_path)

@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from daemon.patterns import render
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Expose
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from drivers.registry import UnknownDriver, load
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 from tests.drivers import aravis_peer, gentl_peer
 from tests.system.harness import Daemon
 

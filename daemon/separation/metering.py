@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.exposure import BRIGHTEST, Limits
 from daemon.separation.radiometry import Response
 
 TARGET = 0.8
 """Where auto-exposure puts the level, as a share of full scale."""
-BRIGHTEST = 0.001
-"""Share of a colour's samples that may be brighter than the level, and so may saturate."""
 
 _TOLERANCE = 0.05
 _LOOKS = 10
@@ -73,24 +72,6 @@ def _colours(pixels: NDArray[Any], bayer: str) -> Iterator[NDArray[Any]]:
         yield from (pixels[y::2, x::2] for y in range(2) for x in range(2))
     else:
         yield pixels
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Which exposures may be chosen. `period_us`: only whole numbers of it, where one fits."""
-
-    shortest_us: float
-    longest_us: float
-    period_us: float | None = None
-
-    def allowed(self, wanted_us: float) -> float:
-        """The longest exposure that may be chosen and is no longer than wanted, else the least."""
-        exposure = min(max(wanted_us, self.shortest_us), self.longest_us)
-        period = self.period_us
-        if period is None or period > self.longest_us:
-            return exposure
-        periods = max(math.floor(exposure / period + 1e-6), math.ceil(self.shortest_us / period), 1)
-        return periods * period
 
 
 @dataclass(frozen=True, slots=True)
