@@ -8,7 +8,7 @@ Consecutive steps become one sequence, as long as projector and ring allow; the 
 That frame k shows image k is proven three times: there are exactly as many frames as images, none
 lost on its way, one period apart by the camera's own clock (drivers.sequence); the white and the
 black image at its head look bright and dark, so that the light is not a period late or early; and
-each frame looks like its pattern (daemon.proof). Frames are handed on only when all of it holds.
+each frame looks like its pattern (daemon.exposing.proof). Frames are handed on only when all holds.
 Otherwise the whole sequence is run again, `attempts` times in all, each at half the pace of the one
 before, for a host that cannot take frames as fast as its camera gives them loses some; then each of
 its frames is an explicit missing record. When no pulse ever gave a frame, the run fails: that is
@@ -31,13 +31,13 @@ from dataclasses import replace
 import numpy as np
 import structlog
 
-from daemon.devicethread import Stuck
+from daemon.devices.devicethread import Stuck
 from daemon.exposing.apparatus import CALL_S, LOOK_S, SHOW_S, Apparatus
 from daemon.exposing.batches import Batches, Shot
 from daemon.exposing.exposer import Exposer
 from daemon.exposing.modes import GUARDS
-from daemon.proof import Proof, head_problem
-from daemon.ring import Buffer
+from daemon.exposing.proof import Proof, head_problem
+from daemon.exposing.ring import Buffer
 from daemon.scans.method import Expose, Unsuitable
 from drivers.base.camera import Acquisition, Camera, Frame
 from drivers.base.errors import DeviceError, DeviceGarbled, DeviceRefused, DeviceTimeout

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import ClassVar, TypeVar
 
 import cv2
@@ -80,6 +81,12 @@ def leakage_of(radiometry: Radiometry, bench: Bench) -> float:
     if radiometry.leakage is not None:
         return radiometry.leakage
     return float((bench.calibration or {}).get("leakage", 0.0))
+
+
+@lru_cache(maxsize=128)
+def _drawn(pattern: AnyPattern, side: int) -> NDArray[np.uint8]:
+    """A pattern as it is shown: for many blurs, and for the next scan."""
+    return patterns.render(pattern, side, side)
 
 
 class PatternMethod(Method[P]):
@@ -222,7 +229,7 @@ class PatternMethod(Method[P]):
             rows, columns = rng.integers(_MARGIN, side - _MARGIN, (2, _SAMPLES))
         found = np.empty((len(self._patterns), rows.size), dtype=np.float32)
         for index, pattern in enumerate(self._patterns):
-            image = patterns.render(pattern, side, side).astype(np.float32) / patterns.LEVELS
+            image = _drawn(pattern, side).astype(np.float32) / patterns.LEVELS
             if blur:
                 image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), dtype=np.float32)
             found[index] = image[rows, columns]

@@ -151,12 +151,17 @@ class OrderModels:
         table = below + part * (above - below)  # (blurs, amounts, groups, 2, keep - 1)
         cost = (np.square(table - gaps).sum(axis=4) * share).sum(axis=3) / size
         costs = cost.min(axis=1).sum(axis=1)
-        best = int(np.argmin(costs))
-        if uneven:
-            return float(best), float(_AMOUNTS[int(np.median(np.argmin(cost[best], axis=0)))])
+        amounts = _AMOUNTS[np.median(np.argmin(cost, axis=1), axis=1).astype(np.intp)]
         # of blurs that explain it about as well the mean: none of them is far from it
-        weight = np.exp((costs[best] - costs) / (_ALIKE * costs[best] + 1e-9))
-        return float(weight @ np.arange(costs.size) / weight.sum()), 1.0
+        weight = np.exp((costs.min() - costs) / (_ALIKE * costs.min() + 1e-9))
+        if uneven:  # which looks like the least of blurs: there is none, or that of the first knot
+            weight[1:_PARTS] = 0.0
+        weight /= weight.sum()
+        found = float(weight @ np.arange(costs.size))
+        if uneven and found < _PARTS:
+            found = float(_PARTS * round(found / _PARTS))
+            return found, float(amounts[int(found)])
+        return found, float(weight @ amounts)
 
 
 def _between(low: OrderErrors, high: OrderErrors, part: float) -> OrderErrors:

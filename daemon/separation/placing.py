@@ -2,9 +2,9 @@
 
 Of each place two levels are known: in light and in shadow, from frames that lie alike. In another
 frame every place is near one of them or between, and what is between, the shadow's edges, has no
-say. The rest is the scene alone: its differences from the level that it is near are explained by a
-small rigid motion and by the strengths of the light in both, in least squares that outliers hardly
-move (Lucas and Kanade; Baker and Matthews, 2004, inverse compositional).
+say. The rest is the scene alone: its differences from the level that it is near, and from what the
+light is around, are explained by a small rigid motion, in least squares that outliers hardly move
+(Lucas and Kanade; Baker and Matthews, 2004, inverse compositional).
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ STILL: Motion = np.eye(3)
 
 _KEPT = 12  # of the frames, one in so many is a level's: its mean
 _NEAR = 0.1  # of the way from one level to the other: a place that is at one
+_ASTRAY = 0.3  # px: edges of the scene that lie off by less are near, too
 _LEAST_SPAN = 0.25  # of the light: a shadow takes as much at least
 _FLOOR = 0.03  # of the bright places' light, whose noise dark places have at least
+_AROUND = 15  # pixels: light that changes over more of them is not the scene's motion
 _EDGE = 2  # pixels along the picture's rim that are left out: they come and go
 _MOST = 5_000  # places that are looked at
 _LEAST = 150  # places that tell anything
@@ -49,15 +51,18 @@ class Levels:
         placed = [back(p, m) for p, m in zip(pictures, motions, strict=True)]
         ranked = np.sort(np.stack(placed), axis=0)
         few = max(1, len(placed) // _KEPT)
-        self._lit = np.asarray(ranked[-few:].mean(0), np.float32)
-        self._unlit = np.asarray(ranked[:few].mean(0), np.float32)
-        self._lit_around, self._unlit_around = _mean(self._lit), _mean(self._unlit)
-        span = self._lit_around - self._unlit_around
-        self._span = np.maximum(span, np.float32(_LEAST_SPAN) * np.abs(self._lit_around))
-        self._span += np.float32(1e-6)
-        self._shaded = span > np.float32(_LEAST_SPAN) * self._lit_around
-        self._slopes = [_slopes(x, self.middle) for x in (self._lit, self._unlit)]
-        self._noisy = np.float32(_FLOOR * max(float(np.nanquantile(self._lit, 0.95)), 1e-3))
+        self._levels = [np.asarray(x.mean(0), np.float32) for x in (ranked[-few:], ranked[:few])]
+        self._around = [_mean(x) for x in self._levels]
+        self._slopes = [_slopes(x, self.middle) for x in self._levels]
+        lit, unlit = self._around
+        least = np.float32(_LEAST_SPAN) * np.abs(lit)
+        self._shaded = lit - unlit > least
+        span = np.maximum(lit - unlit, least)
+        self._near = [
+            np.float32(_NEAR) * span + np.float32(_ASTRAY) * np.hypot(*_slopes(x, self.middle)[:2])
+            for x in self._around
+        ]
+        self._noisy = np.float32(_FLOOR * max(float(np.nanquantile(self._levels[0], 0.95)), 1e-3))
         self._inner = np.zeros((height, width), np.bool_)
         self._inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
 
@@ -83,47 +88,40 @@ class Levels:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """By what x, y and turn a frame lies off, and their variance."""
         around = _mean(picture)
-        near = np.float32(_NEAR) * self._span
-        lit = inner & (np.abs(around - self._lit_around) < near)
-        unlit = inner & self._shaded & (np.abs(around - self._unlit_around) < near)
-        unlit &= ~lit
+        lit, unlit = (
+            inner & (np.abs(around - level) < near)
+            for level, near in zip(self._around, self._near, strict=True)
+        )
+        unlit &= self._shaded & ~lit
         parts = []
-        for where, light, slopes in zip(
-            (lit, unlit), (self._lit, self._unlit), self._slopes, strict=True
-        ):
+        for where, light, slopes in zip((lit, unlit), self._levels, self._slopes, strict=True):
             at = np.flatnonzero(where)
             at = at[:: 1 + at.size // _MOST]
             if at.size < _LEAST:
                 continue
-            level = light.ravel()[at]
+            level = (light * _gain(picture, light, where)).ravel()[at]
             parts.append((level, picture.ravel()[at] - level, slopes.reshape(3, -1)[:, at]))
         if not parts:
             return None
-        light, off = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-        columns = list(np.concatenate([part[2] for part in parts], axis=1))
-        start = 0
-        for part in parts:  # the strength of the light is free, in light and in shadow
-            one = np.zeros_like(light)
-            one[start : start + part[0].size] = part[0]
-            columns.append(one)
-            start += part[0].size
-        design = np.stack(columns, axis=1).astype(np.float64)
+        light, off, design = (np.concatenate([p[k] for p in parts], axis=-1) for k in range(3))
+        design = design.T
         steep = np.square(design[:, 0]) + np.square(design[:, 1])
         shot = np.abs(light) + self._noisy
         flat = steep <= np.median(steep)
-        noise = max(float(np.median(np.square(off[flat]) / shot[flat])) / _MEDIAN, 1e-12)
-        weight = 1.0 / (noise * shot + _UNSHARP**2 * steep)
+        noise = np.float32(max(np.median(np.square(off[flat]) / shot[flat]) / _MEDIAN, 1e-12))
+        weight = 1.0 / (noise * shot + np.float32(_UNSHARP**2) * steep)
         trust = np.ones_like(weight)
-        for _ in range(2):
-            weighted = design * (weight * trust)[:, None]
-            normal = weighted.T @ design
-            if np.linalg.cond(normal) > 1e12:
-                return None
-            answer = np.linalg.solve(normal, weighted.T @ off)
-            left = (off - design @ answer) * np.sqrt(weight)
-            trust = 1.0 / (1.0 + np.square(left / _TRUSTED))
-        variance = np.asarray(np.linalg.inv(normal)[:3, :3], np.float64)
-        return answer[:3], variance
+        try:
+            for _ in range(2):
+                weighted = design * (weight * trust)[:, None]
+                normal = (weighted.T @ design).astype(np.float64)
+                answer = np.linalg.solve(normal, (weighted.T @ off).astype(np.float64))
+                left = (off - design @ answer.astype(np.float32)) * np.sqrt(weight)
+                trust = 1.0 / (1.0 + np.square(left / np.float32(_TRUSTED)))
+            variance = np.asarray(np.linalg.inv(normal), np.float64)
+        except np.linalg.LinAlgError:
+            return None  # nothing there tells of x, of y or of a turn
+        return answer, variance
 
     def _turned(self, x: float, y: float, turn: float) -> Motion:
         """The motion that undoes a step."""
@@ -163,6 +161,13 @@ def back(picture: Plane, motion: Motion) -> Plane:
 def _mean(picture: Plane) -> Plane:
     """Over 3 x 3 pixels; `cv2.blur` keeps running sums, which a NaN would spoil for good."""
     return np.asarray(cv2.filter2D(picture, -1, _NINTH))
+
+
+def _gain(picture: Plane, light: Plane, where: NDArray[np.bool_]) -> Plane:
+    """By how much a frame is brighter around each place: a shadow nearby takes light, too."""
+    size = (_AROUND, _AROUND)
+    of, to = (cv2.blur(np.where(where, x, np.float32(0)), size) for x in (picture, light))
+    return np.divide(of, to, out=np.ones_like(to), where=to > 0)
 
 
 def _slopes(light: Plane, middle: tuple[float, float]) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from daemon.server import Answer, Caller, Server
+from daemon.serving.server import Answer, Caller, Server
 from drivers.base.errors import DeviceLost
 from protocol import wire
 from protocol.errors import Code, UmbraError

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from protocol.errors import Code, UmbraError
 from protocol.messages.rig import RigState
 from protocol.messages.runs import RunState
