@@ -15,8 +15,11 @@ PAGE = Path(__file__).parents[2] / "docs/notebook.md"
 
 
 def test_every_block_runs(
-    daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:  # fmt: skip
+    daemon: Daemon,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     daemon.start().close()
     monkeypatch.setenv("UMBRA_RIG", daemon.endpoint)
