@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from drivers import registry
-from protocol.messages import DEFAULT_COMMAND, DEFAULT_EVENTS
+from protocol.messages.access import DEFAULT_COMMAND, DEFAULT_EVENTS
 from protocol.spelling import did_you_mean, fields_at
 
 _T = TypeVar("_T", bound=msgspec.Struct)

@@ -16,16 +16,16 @@ import structlog
 from numpy.typing import NDArray
 
 from daemon.config import SequencerSection
-from daemon.control import Control
-from daemon.devicethread import Session
+from daemon.devices.devicethread import Session
+from daemon.devices.rig import SAFE_S, Rig
+from daemon.exposing.control import Control
 from daemon.exposing.exposer import Behind
+from daemon.exposing.proof import Look, Proof, look_of
+from daemon.exposing.recorder import Exposed, Recorder
+from daemon.exposing.ring import Buffer, Ring
 from daemon.patterns import predistorted, render
-from daemon.proof import Look, Proof, look_of
-from daemon.recorder import Exposed, Recorder
-from daemon.rig import SAFE_S, Rig
-from daemon.ring import Buffer, Ring
 from daemon.scans.method import Expose, Method, Step
-from drivers.base import Acquisition, Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
 from drivers.clock import NS
 from protocol.patterns import AnyPattern
 

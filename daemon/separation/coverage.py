@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import Judgement, bits, finish
-from daemon.separation.noise import TemporalNoise, noise_range
+from daemon.separation.noise import Noise, TemporalNoise, noise_range
 from daemon.separation.order import Ranked
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
-from daemon.separation.registration import placed
 from daemon.separation.sweeping import Sweeping
+from daemon.separation.warping import without
 
 CELL = 8
 """Side of a cell, in pixels: its mean has an eighth of a pixel's noise."""
@@ -74,8 +74,13 @@ class Occluder:
         self._last: tuple[NDArray[Any], Plane] | None = None
         self._moved = False  # the last frame was interpolated
 
-    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """See `Estimator`."""
+    def update(
+        self,
+        pixels: NDArray[Any],
+        observation: Observation,
+        left_out: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """See `Extremes`."""
         if not observation.used:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
@@ -84,16 +89,13 @@ class Occluder:
             if observation.fresh:
                 self._unused += self._low.frames
                 self._begin()
-            moved = observation.warp is not None
-            if observation.warp is not None:
-                first = self._low.frames == 0
-                known = None if first else (self._high.planes[0], self._low.planes[0])
-                pixels = placed(pixels, observation.warp, bool(self._response.bayer), known)
             pixels = self._response.scaled(pixels, 1.0 / observation.strength)
-            self._low.add(pixels)
-            self._high.add(pixels)
+            known = (self._high.planes[0], self._low.planes[0]) if self._low.frames else None
+            told = without(pixels, left_out, known)
+            self._low.add(told)
+            self._high.add(told)
             self._sweeping.add(pixels)
-            self._watch(pixels, moved)
+            self._watch(pixels, observation.warp is not None)
 
     def _watch(self, pixels: NDArray[Any], moved: bool) -> None:
         """Keep what tells of noise and of the shadow's way."""
@@ -110,6 +112,14 @@ class Occluder:
             self._cell_noise.add(self._last[1], cells)
         self._last, self._moved = (sample, cells), moved
 
+    def brightest(self) -> NDArray[Any] | None:
+        """See `Extremes`."""
+        return self._high.planes[0] if self._high.frames else None
+
+    def noise(self) -> Noise | None:
+        """See `Extremes`."""
+        return self._pixel_noise.noise()
+
     def result(self) -> Components:
         """See `Estimator`. Raises NotYet before two frames are in."""
         frames = self._low.frames
@@ -118,7 +128,7 @@ class Occluder:
         low = self._response.linear(self._low.planes)
         high = self._response.linear(self._high.planes)
         brightest, darkest = high[0], low[0]
-        pixel_noise = self._pixel_noise.noise()
+        pixel_noise = self.noise()
         deviation = self._response.deviation(pixel_noise, self._high.planes[0])
         cells = self._cells(frames)
         seen = self._seen(low, high, deviation, frames, cells)

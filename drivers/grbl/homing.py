@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.base import DeviceError, DeviceGarbled, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceRefused, DeviceTimeout
 from drivers.grbl import faults
 from drivers.grbl import protocol as grbl
 from drivers.grbl.condition import Condition, no_machine_position

@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers.base import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.clock import NS, Clock
 from drivers.grbl import faults
 from drivers.grbl import protocol as grbl

@@ -16,18 +16,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Identity,
-    Options,
-    Stage,
-    StageInfo,
-    StageStatus,
-)
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.stage import Stage, StageInfo, StageStatus
 from drivers.grbl import controller, faults, standstill
 from drivers.grbl import protocol as grbl
 from drivers.grbl.condition import Condition

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from drivers.base import DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceRefused, DeviceTimeout
 from drivers.clock import NS
 from drivers.grbl import protocol as grbl
 from drivers.grbl.condition import Condition, stands

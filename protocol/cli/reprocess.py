@@ -17,7 +17,7 @@ from protocol.cli.runs import Force
 from protocol.cli.scan import Wait, WaitOut, see_through
 from protocol.errors import Code, UmbraError
 from protocol.reading import EXPOSED, READ
-from protocol.scans import Advise
+from protocol.scans.measuring import Advise
 from protocol.spelling import did_you_mean
 
 _OPTIONS = [

@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 from daemon.scans import catalog
 from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting
-from drivers.base import PixelFormat
-from protocol.scans import (
-    AnyScan,
+from drivers.base.pixelformat import PixelFormat
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Radiometry,
     RandomBinary,
     RandomPhase,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry
 from tests.benchmarks import peers
 from tests.benchmarks.ratio import Ratio
 from tests.daemon.scene import FULL, Scene

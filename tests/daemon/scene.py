@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon import patterns
-from daemon.scans import catalog
-from daemon.scans.method import Bench, Expose, Taken
+from daemon.scans.method import Bench, Expose
 from daemon.separation.estimator import Components
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.patterns import BLACK
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
+from tests.daemon.scanning import scanned
 
 FULL = 65535
 OWN_US = 10_000.0
@@ -89,19 +91,7 @@ class Scene:
     def scan(self, spec: AnyScan, seed: int = 1) -> Components:
         """The whole of a scan, as the daemon does it."""
         rng = np.random.default_rng(seed)
-        method = catalog.method_for(spec, self.bench())
-        estimator = method.estimator()
-        index = 0
-        while (step := method.step(index, estimator.summary())) is not None:
-            assert isinstance(step, Expose)
-            for sub in range(step.frames):
-                observation = method.observe(step, Taken(index, sub, incomplete=False))
-                estimator.update(self.frame(step, rng), observation)
-            index += 1
-        assert index
-        result = estimator.result()
-        assert isinstance(result, Components)
-        return method.conclude(result)
+        return scanned(spec, self.bench(), lambda step: self.frame(step, rng))
 
 
 DARK = Expose(BLACK)

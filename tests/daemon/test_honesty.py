@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from daemon.separation.estimator import Quality
-from protocol.scans import (
-    AnySeparation,
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Radiometry,
     RandomBinary,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import Scene
 from tests.daemon.virtual_scene import VirtualScene
 

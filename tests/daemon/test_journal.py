@@ -5,8 +5,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.durable import Damaged, StorageError
-from daemon.journal import Journal, read
+from daemon.storage.durable import Damaged, StorageError
+from daemon.storage.journal import Journal, read
 from protocol.errors import Code
 
 

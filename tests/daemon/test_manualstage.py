@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from daemon import config
-from daemon.manual import Manual
-from daemon.manualstage import ManualStage
-from daemon.rig import Rig
-from daemon.viewfinder import Viewfinder
-from drivers.base import DeviceLost, DeviceRefused
+from daemon.devices.rig import Rig
+from daemon.manual.manual import Manual
+from daemon.manual.manualstage import ManualStage
+from daemon.pictures.viewfinder import Viewfinder
+from drivers.base.errors import DeviceLost, DeviceRefused
 from protocol.errors import UmbraError
-from protocol.messages import Health, StageChanged, StageState
+from protocol.messages.events import StageChanged
+from protocol.messages.rig import Health, StageState
 
 RIG = """
 [rig]

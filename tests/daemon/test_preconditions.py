@@ -7,15 +7,15 @@ import threading
 import msgspec
 import pytest
 
-from daemon.control import Control
-from daemon.devicethread import Revoked, Session
-from daemon.metering import Level
-from daemon.preconditions import LightWatch, Precondition, Preconditions
-from drivers.base import DeviceError, DeviceLost, DeviceRefused
+from daemon.devices.devicethread import Revoked, Session
+from daemon.exposing.control import Control
+from daemon.runs.preconditions import LightWatch, Precondition, Preconditions
+from daemon.separation.metering import Level
+from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import NS, Clock
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunState, Waiting
-from protocol.scans import Ready
+from protocol.messages.runs import RunState, Waiting
+from protocol.scans.spec import Ready
 
 
 class JumpingClock(Clock):

@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-import daemon.frames
-import daemon.journal
-from daemon.durable import StorageError
-from daemon.frames import FrameStore
-from daemon.recorder import Exposed, Recorder
-from daemon.ring import Ring
+import daemon.storage.frames
+import daemon.storage.journal
+from daemon.exposing.recorder import Exposed, Recorder
+from daemon.exposing.ring import Ring
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
 from daemon.separation.estimator import NotYet
-from drivers.base import CameraInfo, Frame, PixelFormat, ProjectorInfo
-from protocol.scans import TwoImage
+from daemon.storage.durable import StorageError
+from daemon.storage.frames import FrameStore
+from drivers.base.camera import CameraInfo, Frame
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
+from protocol.scans.projected import TwoImage
 
 SHAPE = (12, 16)
 CAMERA = CameraInfo(SHAPE[1], SHAPE[0], PixelFormat.MONO8)
@@ -32,7 +34,7 @@ class Disk:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, full: dict[str, int]) -> None:
         self.full = full
         for name in full:
-            place = daemon.journal if name == "_write_at" else daemon.frames
+            place = daemon.storage.journal if name == "_write_at" else daemon.storage.frames
             monkeypatch.setattr(place, name, self._failing(name, getattr(place, name)))
 
     def _failing(self, name: str, real: Any) -> Any:
@@ -125,7 +127,7 @@ def test_after_a_failed_fsync_nothing_is_repeated(
         raise OSError(errno.EIO, "Input/output error", str(path))
 
     course, frames = Course(), store(tmp_path / "broken")
-    monkeypatch.setattr(daemon.frames, "fsync_file", fail)
+    monkeypatch.setattr(daemon.storage.frames, "fsync_file", fail)
     recorder = record(frames, course)
     with pytest.raises(StorageError):
         recorder.finish()

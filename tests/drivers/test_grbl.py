@@ -17,16 +17,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    StageState,
-    StageStatus,
-)
+from drivers.base.device import Context
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.stage import StageState, StageStatus
 from drivers.clock import NS, Clock, RealClock, ScaledClock
 from drivers.grbl import GrblOptions, GrblStage, faults
 from drivers.grbl import protocol as grbl

@@ -11,7 +11,8 @@ from protocol.cli.family import member
 from protocol.cli.options import options_of
 from protocol.cli.scan import spec_in
 from protocol.errors import UmbraError
-from protocol.scans import AnyScan, Checkerboard
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import Checkerboard
 
 
 @pytest.mark.parametrize(

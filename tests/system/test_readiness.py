@@ -9,15 +9,18 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+import msgspec
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from protocol.errors import UmbraError
-from protocol.messages import RigState, RunState, StageState, Status
+from protocol.messages.replies import Status
+from protocol.messages.rig import RigState, StageState
+from protocol.messages.runs import RunState
 from protocol.run import Run
-from protocol.scans import Ready
-from tests.system.harness import Daemon, recorded, until
+from protocol.scans.spec import Ready
+from tests.system.harness import ENDLESS, FAST, SLOW, Daemon, recorded, until
 
 pytestmark = pytest.mark.system
 
@@ -219,12 +222,13 @@ def test_a_scene_that_is_too_dark_is_told_and_scanned(daemon: Daemon) -> None:
 
 
 def test_an_interrupted_run_keeps_the_exposure_that_it_chose(daemon: Daemon) -> None:
-    spec = umbra.Checkerboard(average=4, auto_exposure=True)
-    daemon.configure(projector="refresh_hz = 500")
+    spec = umbra.Checkerboard(average=2, auto_exposure=True)
+    daemon.configure(projector="refresh_hz = 500", scale=SLOW)
     with daemon.start() as rig:
         run = rig.scan(spec).id
         recorded(rig, run, 5)
         daemon.kill()
+    daemon.configure(projector="refresh_hz = 500", scale=FAST)
     chosen = rig_of(daemon, run)["exposure"]
     with daemon.start() as rig:
         rig.camera(exposure_us=1000.0)
@@ -241,7 +245,7 @@ def test_a_run_leaves_the_camera_as_it_found_it(daemon: Daemon) -> None:
         before = rig.camera(exposure_us=12_000.0, gain=1.0)
         assert rig.scan(umbra.TwoImage(exposure_us=8000.0, gain=3.0)).wait(60)
         assert rig.camera() == before
-        run = rig.scan(umbra.Checkerboard(average=32, exposure_us=9000.0))
+        run = rig.scan(msgspec.structs.replace(ENDLESS, exposure_us=9000.0))
         recorded(rig, run.id, 3)
         rig.abort(run.id)
         assert run.wait(60, check=False).state is RunState.ABORTED
