@@ -40,7 +40,7 @@ from drivers.dlpc350_board import Board, Pulse
 from drivers.dlpc350_flash import FlashImages, Place
 from drivers.dlpc350_protocol import Command, Entry
 from drivers.dlpc_hid import DlpcHid, attached
-from drivers.registry import UnknownDriver
+from drivers.registry import UnknownDriver, install
 
 if TYPE_CHECKING:
     from drivers.display import DisplayProjector
@@ -366,7 +366,7 @@ def _display(name: str, options: Dlpc350Options, context: Context) -> DisplayPro
     except ImportError as error:
         raise UnknownDriver(
             f"{name}: dlpc350 with a `display` needs {error.name}, which is not installed: "
-            "pip install 'umbra-rig[display]'"
+            + install("display")
         ) from error
     keys = {"latency_frames": 2.0} | (options.display or {})
     keys["size"] = (dmd.COLUMNS, dmd.ROWS)

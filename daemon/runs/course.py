@@ -284,7 +284,7 @@ class Course:
 
     def _replayed(self, session: Session) -> None:
         """A frame of before has been taken in: a sign of life, and the place to be aborted."""
-        self.standing.live()
+        self.standing.replayed()
         self.control.check(session)
 
     def _replay(self, session: Session, recorder: Recorder, resuming: bool) -> tuple[int, int]:

@@ -114,9 +114,16 @@ class Standing:
 
     def taken(self, tally: Tally) -> None:
         """The estimator has taken one more frame in."""
-        now = self._beat = time.monotonic()
         self._moments.append((self._clock.now_ns(), tally.taken))
-        if now - self._told >= _PROGRESS_S or tally.taken == self._folder.file.planned:
+        self._tell(at_once=tally.taken == self._folder.file.planned)
+
+    def replayed(self) -> None:
+        """The estimator has taken in one more frame of before the interruption."""
+        self._tell(at_once=False)
+
+    def _tell(self, *, at_once: bool) -> None:
+        now = self._beat = time.monotonic()
+        if at_once or now - self._told >= _PROGRESS_S:
             self._told = now
             self._on_progress(self.progress())
 

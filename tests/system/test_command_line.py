@@ -112,12 +112,21 @@ def test_demo(tmp_path: Path) -> None:
     assert set(PRODUCTS) <= {p.name for p in out.iterdir()}
     assert "direct  RMSE 0.0" in done.stdout
     assert "global  RMSE 0.0" in done.stdout
+    assert "carry no flag; the RMSE is over these" in done.stdout
     assert "25/27" in done.stderr or "27/27" in done.stderr
     direct, truth = read(out / "direct.tiff"), read(out / "truth_direct.tiff")
     assert direct.dtype == np.float32
     good = np.isfinite(direct)
     assert np.sqrt(np.mean((direct - truth)[good] ** 2)) < 0.06 * 4095
     assert_no_orphan(tmp_path)
+
+
+def test_demo_of_a_mesh_has_a_lamp_and_a_stage(tmp_path: Path) -> None:
+    done = umbra("demo", "-m", "mesh", "--speed", "4", "--coverage", "0.5", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "scan    mesh" in done.stdout
+    assert "direct  RMSE 0.0" in done.stdout
+    assert (tmp_path / "umbra-demo" / "report.html").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
