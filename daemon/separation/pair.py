@@ -79,8 +79,9 @@ class ComplementPair:
         total: Plane = direct + indirect
         split = as_neighbours(direct, total, planes["direct_std"], edge, mosaic=mosaic)
         direct, indirect = split.direct, total - split.direct
-        for name, plane in planes.items():
-            planes[name] = np.hypot(plane, split.deviation)
+        planes["direct_std"], planes["global_std"] = split.stated(
+            planes["direct_std"], planes["global_std"], total, planes["direct_std"]
+        )
         flags = bits(split.known, Quality.EDGE) | bits(edge & ~split.known, Quality.LOW_MODULATION)
         waves = [wave.astype(np.complex64)]
         strong = strength(waves, noise)

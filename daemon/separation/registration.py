@@ -52,7 +52,6 @@ _SHORTEST = (1, 16, 8, 4, 2, 1, 1, 1, 1)
 """Wavelengths, in small pixels, that count in each round of aligning the first frames: all, to see
 whether they lie apart at all; then long ones first, which a shake leaves in the mean."""
 _SETTLED = 0.15  # px: first frames that wander less from round to round lie apart as they do
-_REFINED = 2  # rounds in which the first frames are placed exactly
 _TILE = 16  # small pixels: halves of the picture are a checkerboard of such squares
 _SAMPLED = 6  # every so many of the first frames show how far the halves agree
 
@@ -235,8 +234,7 @@ class Registration:
             change = np.abs(shifts - before).max() * self._factor
             if shortest == 1 and change < _SETTLED:
                 break
-        motions = self._placed([shifted(*d) for d in shifts])
-        shifts = np.array([self._off(m) for m in motions])
+        self._place_first([shifted(*d) for d in shifts])
         moved = [self._moved(s, *d) for s, d in zip(spectra, shifts, strict=True)]
         mean = np.mean(moved, axis=0)
         shadow = np.mean([np.abs(s - mean) ** 2 for s in moved], axis=0) * count / (count - 1)
@@ -249,18 +247,11 @@ class Registration:
             self._coarse_sd = self._factor * math.sqrt(float(np.trace(np.linalg.inv(curvature))))
         unaligned = np.mean([np.abs(s - np.mean(spectra, axis=0)) ** 2 for s in spectra], 0)
         self._explained = 1.0 - _both(shadow) / max(_both(unaligned), 1e-9)
-        self.wandered = max(self._place(motion, True).px for motion in motions)
+        self.wandered = float(np.hypot(*shifts.T).max()) * self._factor
 
-    def _placed(self, motions: list[Motion]) -> list[Motion]:
-        """The first frames' motions, from ones nearby; makes the levels that all others are placed
-        by, and sees how well two halves of the picture agree about them."""
-        for _ in range(_REFINED):
-            levels = Levels(self._first, motions)
-            found = [levels.place(p, m) for p, m in zip(self._first, motions, strict=True)]
-            motions = [m if f is None else f[0] for m, f in zip(motions, found, strict=True)]
-            middle = np.median([m[:2].ravel() for m in motions], axis=0).reshape(2, 3)
-            middle = np.linalg.inv(np.vstack([middle, [0.0, 0.0, 1.0]]))
-            motions = [m @ middle for m in motions]
+    def _place_first(self, motions: list[Motion]) -> None:
+        """Make the levels that all others are placed by, of the first frames, which have moved so,
+        and see how well two halves of the picture agree about these."""
         self._levels = levels = Levels(self._first, motions)
         rows, columns = np.indices(self._first[0].shape) // _TILE
         odd = (rows + columns) % 2 == 1
@@ -273,7 +264,6 @@ class Registration:
         if apart:
             # of both halves together the deviation is half of their difference's
             self.sd = self._factor * float(np.sqrt(np.mean(np.square(apart)) * 2.0)) / 2.0
-        return motions
 
     def _off(self, motion: Motion) -> NDArray[np.float64]:
         """By how much the middle of a small picture is shifted."""

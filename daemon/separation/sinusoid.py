@@ -123,9 +123,13 @@ class LeastSquares:
         between: dict[str, Any] = {}
         if self._patches:
             split = self._between_patches(ready[0], noise, direct, indirect, np.sqrt(direct_var))
-            direct, indirect = split.direct, direct + indirect - split.direct
-            direct_var += np.square(split.deviation)
-            global_var += np.square(split.deviation)
+            total: Plane = direct + indirect
+            direct, indirect = split.direct, total - split.direct
+            total_std = np.sqrt(np.maximum(global_var - direct_var, np.float32(0.0)))
+            direct_std, global_std = split.stated(
+                np.sqrt(direct_var), np.sqrt(global_var), total, total_std
+            )
+            direct_var, global_var = np.square(direct_std), np.square(global_std)
             quality |= bits(split.known, Quality.EDGE)
             between["edges"] = round(float(np.mean(split.known)), 4)
         if len(solved) > 1:
@@ -134,9 +138,11 @@ class LeastSquares:
         rippled = self._ripple(ready, noise)
         if reflected is not None:
             quality |= bits(reflected, Quality.RESIDUE)
+        doubt = self._doubt(blur)
+        of_blur = np.square(direct * np.float32(doubt))
         planes: dict[str, NDArray[Any]] = {
-            "direct_std": np.sqrt(direct_var),
-            "global_std": np.sqrt(global_var),
+            "direct_std": np.sqrt(direct_var + of_blur),
+            "global_std": np.sqrt(global_var + of_blur),
         }
         planes.update(self._correspondence(ready))
         mean = np.add.reduce([fit.solve()[0] for fit in ready]) * np.float32(1.0 / len(ready))
@@ -153,6 +159,7 @@ class LeastSquares:
             "frequencies": len(ready),
             "blur_px": None if blur is None else round(blur, 3),
             "blur_from": blur_from,
+            "blur_unsure": round(doubt, 4),
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
@@ -180,8 +187,8 @@ class LeastSquares:
             brightest=brightest,
             saturated=self._saturated,
             judgement=Judgement(
-                direct=np.float32(SIGNIFICANT) * planes["direct_std"],
-                total=np.float32(SIGNIFICANT) * planes["global_std"],
+                direct=np.float32(SIGNIFICANT) * np.sqrt(direct_var),
+                total=np.float32(SIGNIFICANT) * np.sqrt(global_var),
                 deviation=self._level(ready[0], noise),
             ),
             flags=quality,
@@ -226,6 +233,15 @@ class LeastSquares:
             logs.append(0.5 * float(np.log(np.maximum(np.median(ratio), 1e-6))))
         slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
         return float(np.sqrt(max(-slope, 0.0))), "scan"
+
+    def _doubt(self, blur: float | None) -> float:
+        """The part of direct light that the blur leaves unsure, as a deviation: a quarter of what
+        it took, for it is one figure for all the scene; unknown, half of what 1 px of it takes."""
+        if not self._periods:
+            return 0.0
+        part, sigma = (0.5, 1.0) if blur is None else (0.25, blur)
+        kept = [of_wave(sigma, period, self._weave) for period in self._periods]
+        return part * (1.0 - sum(kept) / len(kept))
 
     def _unknown(self, blur: float | None) -> list[str]:
         """A line where blur may matter and is not known."""

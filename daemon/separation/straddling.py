@@ -21,9 +21,8 @@ Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _NEAR = 5  # pixels across: parts of a pattern so near to each other leave an edge between
-_WHOLE = 0.85  # of the contrast nearby: less is an edge's
-_TOLD = 3.0  # deviations of noise that tell lit from unlit
-_SHORT = 2.0  # and contrast that is short: a whole pixel taken for an edge is hardly worse
+_WHOLE = 0.93  # of the contrast nearby: less is an edge's
+_TOLD = 3.0  # deviations of noise
 _ALIKE = 0.95  # length of the mean of phases that are alike
 _REACHES = (5, 9, 17)  # pixels across, within which whole neighbours are looked for
 _SOME = 0.1  # of the weight there must be theirs
@@ -52,7 +51,7 @@ def edges(contrast: Plane, noise: Plane, between: Mask, *, mosaic: bool) -> Mask
         kernel[1::2, :] = kernel[:, 1::2] = 0
     most = np.asarray(cv2.dilate(contrast, kernel))
     short = most * np.float32(_WHOLE) - contrast
-    return np.asarray(between & (short > np.float32(_SHORT) * noise))
+    return np.asarray(between & (short > np.float32(_TOLD) * noise))
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +62,17 @@ class Split:
     direct: Plane
     deviation: Plane
     known: Mask
+
+    def stated(
+        self, direct_std: Plane, global_std: Plane, total: Plane, total_std: Plane
+    ) -> tuple[Plane, Plane]:
+        """Deviations of both components: at edges those of parts of the total, elsewhere as given;
+        and how much neighbours differ."""
+        part: Plane = np.clip(self.direct / np.maximum(total, np.float32(1e-3)), 0.0, 1.0)
+        known = _as(self.known, part)
+        of_direct: Plane = np.where(known, part * total_std, direct_std)
+        of_global: Plane = np.where(known, (np.float32(1.0) - part) * total_std, global_std)
+        return np.hypot(of_direct, self.deviation), np.hypot(of_global, self.deviation)
 
 
 def as_neighbours(direct: Plane, total: Plane, noise: Plane, edge: Mask, *, mosaic: bool) -> Split:

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Observation
-from daemon.separation.extremes import MaxMin
+from daemon.separation.extremes import Extremes
 from daemon.separation.mosaic import colour_masks, demosaic, orders_of
 from daemon.separation.radiometry import Response
 
@@ -69,8 +69,8 @@ def test_separating_raw_agrees_with_separating_colours(bayer: str) -> None:
     smooth = np.stack([np.sin(x / 25) + 2, np.cos(y / 20) + 2, np.sin((x + y) / 30) + 2], axis=2)
     direct, indirect = 8000 * smooth, 5000 * smooth[::-1]
     lit = (x // 8 + y // 8) % 2 == 0
-    raw = MaxMin(Response(full_scale=65535, bayer=bayer), lit_fraction=0.5, leakage=0.0)
-    colour = MaxMin(Response(full_scale=65535), lit_fraction=0.5, leakage=0.0)
+    raw = Extremes(Response(full_scale=65535, bayer=bayer), lit_fraction=0.5, leakage=0.0)
+    colour = Extremes(Response(full_scale=65535), lit_fraction=0.5, leakage=0.0)
     for index, shade in enumerate((lit, ~lit)):
         light = direct * shade[..., None] + 0.5 * indirect
         colour.update(np.rint(light).astype(np.uint16), Observation(pattern=index))

@@ -111,7 +111,6 @@ def test_fitted_deviations_are_those_of_repeated_scans() -> None:
         Sinusoid(phases=6),
         RandomPhase(phases=5),
         GrayCode(average=2),
-        TwoImage(average=3),
     ):
         scene = Scene(sigma=0.01, ambient=0.06)
         runs = [scene.scan(spec, seed=seed) for seed in range(10)]

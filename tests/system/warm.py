@@ -43,7 +43,9 @@ class Process:
             socket.send_fds(_nursery(), [request], [stderr, writing])
         finally:
             os.close(writing)
-        self.pid = int(self._news.readline())
+        born = self._news.readline()
+        assert born, "the nursery has ended: its error output says why"
+        self.pid = int(born)
         self.returncode: int | None = None
 
     def poll(self) -> int | None:
