@@ -41,6 +41,7 @@ from daemon.storage.store import Store
 from protocol.errors import UmbraError
 from protocol.messages.events import AnyEvent, DeviceChanged, Logged, PreviewTaken
 from protocol.messages.rig import DeviceInfo, RigState
+from protocol.wire import MOST_BYTES
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """What ends the daemon in an orderly way: the service manager, Ctrl-C, a terminal that closes."""
@@ -290,6 +291,7 @@ class _Daemon:
             socket.sndhwm = HIGH_WATER
         else:
             socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
+            socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)  # more than that is no request
         access.lock(socket)
         try:
             socket.bind(endpoint)

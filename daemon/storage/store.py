@@ -71,7 +71,8 @@ class Store:
             self._runs.mkdir(parents=True, exist_ok=True)
             self._held = _hold(data / "umbrad.lock")
             for path in self._runs.glob(".*"):
-                shutil.rmtree(path)
+                if path.is_dir() and not path.is_symlink():  # a file is somebody's: .DS_Store
+                    shutil.rmtree(path)
         self.scan()
 
     def __enter__(self) -> Store:

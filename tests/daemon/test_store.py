@@ -133,6 +133,15 @@ def test_half_made_and_half_deleted_folders_are_swept_up(tmp_path: Path) -> None
     assert not half.exists()
 
 
+def test_somebodys_file_among_the_runs_is_left_alone(tmp_path: Path) -> None:
+    with Store(tmp_path):
+        (tmp_path / "runs" / ".DS_Store").write_bytes(b"x")
+        (tmp_path / "runs" / "notes.txt").write_bytes(b"x")
+    with Store(tmp_path) as store:
+        assert not store.damaged
+    assert (tmp_path / "runs" / ".DS_Store").exists()
+
+
 def test_two_daemons_never_share_a_folder(tmp_path: Path) -> None:
     code = (
         "import sys, pathlib; from daemon.storage.store import Store\n"

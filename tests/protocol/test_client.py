@@ -86,6 +86,11 @@ def test_every_command_is_in_the_table_of_answers() -> None:
     assert set(replies.ANSWERS.values()) <= set(replies.AnyReply.__args__)
 
 
+def test_a_request_that_is_too_large_is_not_sent(rig: Client) -> None:
+    with pytest.raises(UmbraError, match=r"the request has 5\.0 MB, at most 4\.2 are taken"):
+        rig.submit(Checkerboard(note="n" * 5_000_000))
+
+
 def test_methods_show_their_signature_and_docstring(fake: FakeRig) -> None:
     assert inspect.signature(Client.submit) == inspect.signature(Commands.submit)
     with Client(fake.endpoint) as rig:
