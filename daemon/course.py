@@ -13,6 +13,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from datetime import datetime
 from typing import Any
 
@@ -24,6 +25,7 @@ from daemon.control import Control
 from daemon.devicethread import Revoked, Session
 from daemon.durable import StorageError
 from daemon.ending import close, end_of, of_lost, utc_now, with_exposure
+from daemon.exposing.ahead import frames_ahead
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.exposer import Behind
 from daemon.exposing.modes import Choice, Mode, choose
@@ -183,7 +185,7 @@ class Course:
             recorder = self._recorder = self.standing.recorder = Recorder(
                 method, frames, ring, self._taken, self._disk_full
             )
-            step, sub = self._replay(session, recorder, resuming)
+            step, sub = self._replay(session, method, recorder, resuming)
             recorder.start()
             self.standing.say("scanning")
             self._timings["prepare_s"] = time.monotonic() - began
@@ -288,7 +290,11 @@ class Course:
         self.standing.live()
         self.control.check(session)
 
-    def _replay(self, session: Session, recorder: Recorder, resuming: bool) -> tuple[int, int]:
+    def _replay(
+        self, session: Session, method: Method[Any], recorder: Recorder, resuming: bool
+    ) -> tuple[int, int]:
+        with closing(frames_ahead(self._rig.camera, session, self.standing.live)) as ahead:
+            method.foresee(ahead)
         if not resuming:
             return 0, 0
         self.standing.say("taking in what was recorded before the interruption")
