@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from datetime import datetime
 from typing import Any
 
@@ -21,6 +22,7 @@ import structlog
 from daemon.config import RigConfig
 from daemon.devices.devicethread import Revoked, Session
 from daemon.devices.rig import SAFE_S, Rig
+from daemon.exposing.ahead import frames_ahead
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.control import Control
 from daemon.exposing.exposer import Behind
@@ -186,7 +188,7 @@ class Course:
             recorder = self._recorder = self.standing.recorder = Recorder(
                 method, frames, ring, self._taken, self._disk_full
             )
-            step, sub = self._replay(session, recorder, resuming)
+            step, sub = self._replay(session, method, recorder, resuming)
             recorder.start()
             self.standing.say("scanning")
             self._timings["prepare_s"] = time.monotonic() - began
@@ -287,7 +289,11 @@ class Course:
         self.standing.replayed()
         self.control.check(session)
 
-    def _replay(self, session: Session, recorder: Recorder, resuming: bool) -> tuple[int, int]:
+    def _replay(
+        self, session: Session, method: Method[Any], recorder: Recorder, resuming: bool
+    ) -> tuple[int, int]:
+        with closing(frames_ahead(self._rig.camera, session, self.standing.live)) as ahead:
+            method.foresee(ahead)
         if not resuming:
             return 0, 0
         self.standing.say("taking in what was recorded before the interruption")

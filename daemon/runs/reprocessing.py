@@ -185,6 +185,9 @@ class Reprocessing:
                 result = estimator.result()
             return method.conclude(result) if isinstance(result, Components) else result
 
+        if method.bench.camera.recorded:
+            records = frames.records()[: len(frames)]
+            method.foresee(frames.read(r.index) for r in records if not r.missing)
         missing, seen = dict[int, str](), set[int]()
         scratch = None
         at: tuple[int, Step] | None = None

@@ -7,7 +7,7 @@ far as frames have been taken in, so it may repeat, extend or end; it never touc
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -149,6 +149,11 @@ class Method(ABC, Generic[S]):
     @abstractmethod
     def observe(self, step: Step, taken: Taken) -> Observation:
         """Decide what a frame is used for. Called once a frame, in order; recorded."""
+
+    def foresee(self, frames: Iterator[NDArray[Any]]) -> None:
+        """See the frames of a recording, references included, before the first is observed or
+        recalled: as many as the method asks for. Each lasts until the next."""
+        del frames
 
     def recall(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See a frame again that was observed before an interruption; in order."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 from typing import Any, TypeVar
 
 from numpy.typing import NDArray
@@ -24,8 +25,6 @@ from daemon.scans.method import (
 from daemon.scans.pattern_scan import REFERENCES, response_of
 from daemon.separation.estimator import Components, Lighting, Observation
 from daemon.separation.registration import (
-    LEAST_PX,
-    REFERENCE,
     Place,
     Registration,
 )
@@ -53,6 +52,10 @@ GROWTH = 0.0005
 
 MANY_LOST = 0.1
 """A part of the frames, lost, that is to be told with the coverage that they would have brought."""
+
+MOST_WANDERED = 0.3
+"""Pixels by which the camera may have moved while its place was learned: beyond it a live
+collection begins anew."""
 
 INCOMPLETE = "incomplete frame"
 LOST = "lost frame"
@@ -100,6 +103,7 @@ class OccluderMethod(Method[O]):
         self._came = 0  # frames, with those that were lost
         self._used = 0  # frames of the occluder in the present collection
         self._brighter = 0  # frames in a row
+        self._strengths = (1.0, 1.0)  # of the source, the least and the most
         self._in_vain = _InVain()
         self._references = tuple(Expose(*REFERENCES[reference]) for reference in wanted)
         self._watch = Watch(
@@ -158,6 +162,19 @@ class OccluderMethod(Method[O]):
         if lighting is not Lighting.PATTERN:
             return Observation(lighting=lighting)
         return self._decide(taken.pixels)
+
+    def foresee(self, frames: Iterator[NDArray[Any]]) -> None:
+        """See `Method`: the first frames of a recording tell the camera's place in all, these
+        among them."""
+        if self._live or self._camera is None:
+            return
+        for pixels in islice(frames, len(self._references), None):
+            if self._camera is None or self._placed(pixels) is not None:
+                return
+            self._learn_place(pixels)
+        if self._camera is not None:
+            self._camera.settle()
+            self._judge_place()
 
     def recall(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Method`: what was decided before is decided again, to be followed on."""
@@ -228,17 +245,20 @@ class OccluderMethod(Method[O]):
         camera.learn(pixels)
         if not camera.learned:
             return False
-        if not camera.tells:
+        self._judge_place()
+        return self._live and self._camera is not None and camera.wandered >= MOST_WANDERED
+
+    def _judge_place(self) -> None:
+        """See whether what was learned tells the camera's place, and say so."""
+        camera = self._camera
+        if camera is None:
+            return
+        if not camera.learned:
+            self._camera, self._place = None, "not looked for: the recording is too short"
+        elif not camera.tells:
             self._camera, self._place = None, "not looked for: the scene has too little texture"
-            return False
-        self._place = f"known to {camera.sd:.2g} px"
-        if camera.wandered < 2.0 * LEAST_PX:
-            return False
-        if not self._live:
-            self._place += (
-                f"; the first {REFERENCE} frames lay up to {camera.wandered:.1f} px apart"
-            )
-        return self._live
+        else:
+            self._place = f"known to {camera.sd:.2g} px"
 
     def _weather(self, pixels: NDArray[Any]) -> tuple[str, float]:
         """Why the collection begins anew with this frame ("": it does not), and the source's
@@ -247,10 +267,13 @@ class OccluderMethod(Method[O]):
         if source is None:
             return "", 1.0
         strength = round(source.of(pixels), 4)
+        least, most = self._strengths
+        self._strengths = min(least, strength), max(most, strength)
         self._brighter = self._brighter + 1 if strength > 1.0 + MOST_CHANGE else 0
         if self._brighter < LASTING:
             return "", strength
         self._brighter = 0
+        self._strengths = (1.0, 1.0)
         source.restart()
         return BEGAN_DARK, 1.0
 
@@ -260,6 +283,8 @@ class OccluderMethod(Method[O]):
         facts: dict[str, Any] = {"aligned_frames": self._aligned}
         if self._place:
             facts["camera_place"] = self._place
+        if self._source is not None:
+            facts["source_strength"] = list(self._strengths)
         if self._rejected:
             facts["rejected"] = dict(self._rejected)
         return replace(components, facts={**components.facts, **facts})

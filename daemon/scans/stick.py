@@ -34,7 +34,9 @@ class StickMethod(OccluderMethod[Stick]):
     def estimator(self) -> Estimator:
         """See `Method`."""
         return Steadied(
-            self.response, lambda: Occluder(self.response, lit_fraction=self.spec.lit_fraction)
+            self.response,
+            lambda: Occluder(self.response, lit_fraction=self.spec.lit_fraction),
+            few=True,
         )
 
 

@@ -151,7 +151,7 @@ def back(picture: Plane, motion: Motion) -> Plane:
             picture,
             motion[:2],
             picture.shape[::-1],
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=math.nan,
         )

@@ -60,8 +60,12 @@ class Extremes(Estimator, Protocol):
 class Steadied:
     """The estimator of an occluder's frames (see `Estimator`), whatever the camera did."""
 
-    def __init__(self, response: Response, make: Callable[[], Extremes]) -> None:
+    def __init__(
+        self, response: Response, make: Callable[[], Extremes], *, few: bool = False
+    ) -> None:
+        """`few`: each pixel is in shadow in a few frames only, of which none can be left out."""
         self._response = response
+        self._few = few
         self._bayer = bool(response.bayer)
         self._sure = make()
         self._all: Extremes | None = None
@@ -82,14 +86,17 @@ class Steadied:
         self, pixels: NDArray[Any], observation: Observation, warp: tuple[float, ...]
     ) -> None:
         outside = beyond(pixels.shape, warp, self._bayer)
-        scene = None if observation.fresh else self._sure.brightest()
-        doubtful = outside | uncertain(pixels, warp, self._bayer, self._sure.noise(), scene)
         moved = aligned(pixels, warp, self._bayer)
         moved = self._response.scaled(moved, 1.0 / observation.strength)
         observation = msgspec.structs.replace(observation, strength=1.0)
+        if self._few:
+            self._sure.update(moved, observation, outside)
+            return
+        scene = None if observation.fresh else self._sure.brightest()
+        doubtful = outside | uncertain(pixels, warp, self._bayer, self._sure.noise(), scene)
         if self._all is None:
             self._all = copy.deepcopy(self._sure)
-            if observation.fresh:
+            if scene is None:
                 self._spoiled = doubtful
         self._sure.update(moved, observation, doubtful)
         self._all.update(moved, observation, outside)

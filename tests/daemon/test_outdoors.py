@@ -65,6 +65,9 @@ def test_drift_and_clouds_change_nothing_beyond_the_noise() -> None:
     cloudy = under("cloudy", 3)
     rejected = cloudy.components.facts["rejected"]
     assert rejected["cloud"] > 20
+    least, most = cloudy.components.facts["source_strength"]
+    assert least == pytest.approx(0.5, abs=0.03)
+    assert most == pytest.approx(1.0, abs=0.1)
     assert steady.components.facts["penumbra_mm"] == pytest.approx(1.4, abs=0.2)
     assert steady.components.facts["leakage_at_most"] == 0.0
     noise, found = apart(steady, under("steady", 2)), apart(steady, cloudy)
