@@ -248,7 +248,7 @@ class Stick(OccluderScan, frozen=True, kw_only=True, tag="stick"):
 
 class Mesh(OccluderScan, frozen=True, kw_only=True, tag="mesh"):
     """A grid of holes on a small circle, on video (§4.2): α is the hole fraction β, b = 0 in the
-    umbra. β is told, or follows from the mesh, or is measured (with an ambient and an open frame).
+    umbra. β is told, or follows from the mesh, or is measured: places are lit for β of the time.
     """
 
     hole_fraction: (
