@@ -234,7 +234,7 @@ class Stick(OccluderScan, frozen=True, kw_only=True, tag="stick"):
     """
 
     lit_fraction: LitFraction = 1.0
-    estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
+    estimator: Annotated[Literal["auto", "maxmin"], Meta(description=ESTIMATOR)] = "auto"
     axis: Annotated[Axis, Meta(description="axis of the stage along which the stick moves")] = (
         Axis.X
     )

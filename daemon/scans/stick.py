@@ -32,7 +32,11 @@ class StickMethod(OccluderMethod[Stick]):
 
     def estimator(self) -> Estimator:
         """See `Method`."""
-        return Occluder(self.response, lit_fraction=self.spec.lit_fraction)
+        return Occluder(
+            self.response,
+            lit_fraction=self.spec.lit_fraction,
+            averaged=self.spec.estimator == "auto",
+        )
 
 
 def _sweep(spec: Stick, stage: StageInfo) -> Sweep:
