@@ -4,25 +4,27 @@ from protocol.aio import AsyncClient
 from protocol.client import Client, connect
 from protocol.errors import Code, UmbraError
 from protocol.patterns import BLACK, WHITE, Checker, Solid
-from protocol.scans import (
-    Advise,
+from protocol.scans.calibrations import (
     CalibrateDark,
     CalibrateLatency,
     CalibrateLeak,
     CalibrateNoise,
     CalibrateTone,
+)
+from protocol.scans.measuring import Advise
+from protocol.scans.occluded import Mesh, Stick
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Mesh,
-    Point,
-    Radiometry,
     RandomBinary,
     RandomPhase,
-    Reference,
     SingleImage,
     Sinusoid,
-    Stick,
     TwoImage,
+)
+from protocol.scans.spec import Radiometry, Reference
+from protocol.scans.verifications import (
+    Point,
     VerifyCheckerSize,
     VerifyLitFraction,
     VerifyPatchSize,

@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from drivers import registry
-from protocol.messages import DEFAULT_COMMAND, DEFAULT_EVENTS
+from protocol.messages.access import DEFAULT_COMMAND, DEFAULT_EVENTS
 
 _T = TypeVar("_T")
 

@@ -18,7 +18,8 @@ from typing import Any
 import gi
 import numpy as np
 
-from drivers.base import Context, DeviceLost, DeviceRefused, Identity
+from drivers.base.device import Context, Identity
+from drivers.base.errors import DeviceLost, DeviceRefused
 from drivers.sfnc import Nodes, SfncCamera, SfncOptions, Value
 from drivers.streaming import Buffer
 

@@ -4,7 +4,7 @@ Works under a desktop (X11, Wayland) and without one (KMSDRM), where SDL owns th
 is the better way for an instrument. What the projector does with the picture (keystone, sharpening,
 gamma) is set on the projector: docs/hardware.md has the list.
 
-The window has a process of its own (drivers/displaywindow.py): when the X server ends, Xlib ends
+The window has a process of its own (drivers/displayprocess.py): when the X server ends, Xlib ends
 every program that uses it, and a graphics driver may crash or hang. Here that is DeviceLost, and
 the next `connect` starts another process. `show`, `safe` and `check` are safe to send again.
 """
@@ -24,19 +24,14 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Context,
-    DeviceLost,
-    DeviceRefused,
-    Identity,
-    Options,
-    Projector,
-    ProjectorInfo,
-)
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceLost, DeviceRefused
+from drivers.base.projector import Projector, ProjectorInfo
 from drivers.clock import NS
-from drivers.displaywindow import Call, DisplayOptions, DisplayWindow, Reply
+from drivers.displayprocess import Call, Reply
+from drivers.displaywindow import DisplayOptions, DisplayWindow
 
-PROGRAM = "from drivers.displaywindow import main; main()"
+PROGRAM = "from drivers.displayprocess import main; main()"
 START_S = 20.0  # to start Python, SDL and the output
 CALL_S = 4.0  # for a flip: some refreshes of the slowest output; less than the daemon waits
 LEAVE_S = 2.0  # for the process to end by itself

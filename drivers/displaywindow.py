@@ -5,24 +5,13 @@ image is neither scaled nor filtered, the cursor is hidden, the screen saver is 
 
 Under X11 the end of the X server ends this process, too (Xlib knows no other way), and SDL belongs
 to the thread that started it, one display a process: drivers/display.py gives it a process.
-
-`main` is that process: told one `Call` at a time over a connection, it answers with a `Reply`;
-pictures lie in shared memory. It ends when the connection does, and at no signal of a terminal or a
-service manager.
 """
 
 from __future__ import annotations
 
-import ctypes
-import mmap
 import os
-import signal
-import sys
 import threading
 import warnings
-from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -32,25 +21,12 @@ from numpy.typing import NDArray
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 import pygame
 
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceLost,
-    DeviceRefused,
-    Identity,
-    Options,
-    Projector,
-    ProjectorInfo,
-)
+from drivers import sdl
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused
+from drivers.base.projector import Projector, ProjectorInfo
 from drivers.clock import NS
 
-HINTS = {
-    "SDL_NO_SIGNAL_HANDLERS": "1",  # SIGTERM is the daemon's
-    "SDL_VIDEO_DOUBLE_BUFFER": "1",  # KMSDRM: a flip returns when it has happened
-    "SDL_RENDER_SCALE_QUALITY": "nearest",
-    "SDL_VIDEO_MINIMIZE_ON_FOCUS_LOSS": "0",  # a click on another screen must not take it down
-    "SDL_VIDEO_ALLOW_SCREENSAVER": "0",
-}
 ASSUMED_FRAMES = 6.0  # what slow projectors need
 MEASURED = 24  # flips, to learn the refresh rate
 FASTEST_HZ = 500.0  # flips that come faster do not wait for the refresh
@@ -76,30 +52,6 @@ class DisplayOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
     windowed: bool = False  # in a window of `size`, paced by the clock: to try out, no more
 
 
-class _Screen:
-    """SDL's one display in this process, and who has it."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._owner: object = None
-
-    def take(self, owner: object) -> bool:
-        """Have it, unless somebody else does."""
-        with self._lock:
-            if self._owner in {None, owner}:
-                self._owner = owner
-            return self._owner is owner
-
-    def leave(self, owner: object) -> None:
-        """Let others have it."""
-        with self._lock:
-            if self._owner is owner:
-                self._owner = None
-
-
-_screen = _Screen()
-
-
 class DisplayWindow(Projector):
     """A projector within this process; `show`, `safe` and what they give: see DisplayProjector."""
 
@@ -121,7 +73,7 @@ class DisplayWindow(Projector):
     def connect(self) -> Identity:
         """See Device. Takes half a second: the refresh rate is measured, on black."""
         self.close()
-        if not _screen.take(self):
+        if not sdl.screen.take(self):
             raise self._refuse(
                 "connect",
                 "another device of this rig has the display",
@@ -142,9 +94,9 @@ class DisplayWindow(Projector):
             ) from error
 
     def _open(self) -> Identity:
-        _start(self._o.video_driver)
+        sdl.start(self._o.video_driver)
         driver = pygame.display.get_driver()
-        index = self._find(_names(driver))
+        index = self._find(sdl.names(driver))
         output = pygame.display.get_desktop_sizes()[index]
         size = self._o.size or output
         if self._o.windowed:
@@ -168,7 +120,7 @@ class DisplayWindow(Projector):
         self._surface, self._size = surface, size
         self._check_window("connect")
         self._refresh_hz = self._measure()
-        name = _names(driver)[index]
+        name = sdl.names(driver)[index]
         self._facts = {
             "output": name,
             "sdl": ".".join(map(str, pygame.get_sdl_version())),
@@ -263,10 +215,10 @@ class DisplayWindow(Projector):
 
     def close(self) -> None:
         """See Device."""
-        if _screen.take(self):
+        if sdl.screen.take(self):
             self._surface = None
             pygame.display.quit()
-            _screen.leave(self)
+            sdl.screen.leave(self)
 
     # ------------------------------------------------------------ what it shows
 
@@ -323,11 +275,11 @@ class DisplayWindow(Projector):
     def discover(cls) -> list[dict[str, Any]]:
         """See Device. [] while this process shows something, or where there is no display."""
         here = object()
-        if not _screen.take(here):
+        if not sdl.screen.take(here):
             return []
         try:
-            _start("")
-            names = _names(pygame.display.get_driver())
+            sdl.start("")
+            names = sdl.names(pygame.display.get_driver())
             sizes = pygame.display.get_desktop_sizes()
             return [
                 {
@@ -341,104 +293,4 @@ class DisplayWindow(Projector):
             return []
         finally:
             pygame.display.quit()
-            _screen.leave(here)
-
-
-# ---------------------------------------------------------------- the process
-
-
-@dataclass(frozen=True, slots=True)
-class Call:
-    """What to do: a method of the window; `shape` of the picture in the shared memory."""
-
-    method: str
-    shape: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Reply:
-    """What came of it: a value, or the kind and the words of a DeviceError."""
-
-    value: Any = None
-    error: type[DeviceError] | None = None
-    words: tuple[str, ...] = field(default=())
-
-
-def serve(calls: Connection, memory: int) -> None:
-    """Be the window that the first message describes, until the connection ends."""
-    name, options = calls.recv()
-    window = DisplayWindow(name, options, Context())
-    pixels: mmap.mmap | None = None
-    while True:
-        try:
-            call: Call = calls.recv()
-        except EOFError:
-            break
-        try:
-            if call.method == "connect":
-                value: Any = (window.connect(), window.info(), window.facts())
-                width, height = value[1].width, value[1].height
-                os.ftruncate(memory, 3 * width * height)
-                pixels = mmap.mmap(memory, 3 * width * height)
-            elif call.method == "show":
-                assert pixels is not None
-                value = window.show(np.ndarray(call.shape, np.uint8, pixels))
-            else:
-                value = getattr(window, call.method)()
-            reply = Reply(value)
-        except DeviceError as error:
-            reply = Reply(None, type(error), (error.phase, error.problem, error.remedy))
-        calls.send(reply)
-    window.close()
-
-
-def main() -> None:
-    """The process, given the file descriptors of its connection and of the shared memory."""
-    for ending in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(ending, signal.SIG_IGN)
-    serve(Connection(int(sys.argv[1])), int(sys.argv[2]))
-
-
-def _start(video_driver: str) -> None:
-    """Start SDL's video in this thread. Raises pygame.error, also where nothing can be seen."""
-    for key, value in HINTS.items():
-        os.environ.setdefault(key, value)
-    if video_driver:
-        before = os.environ.get("SDL_VIDEODRIVER")
-        os.environ["SDL_VIDEODRIVER"] = video_driver
-    try:
-        pygame.display.init()
-    finally:
-        if video_driver:
-            del os.environ["SDL_VIDEODRIVER"]
-            if before is not None:
-                os.environ["SDL_VIDEODRIVER"] = before
-    if (driver := pygame.display.get_driver()) in {"dummy", "offscreen"}:
-        raise pygame.error(f"no display was found (its {driver} driver shows nothing)")
-
-
-def _names(driver: str) -> list[str]:
-    """The outputs' names in SDL's order: the connectors' under KMSDRM, else SDL's own."""
-    count = pygame.display.get_num_displays()
-    if driver == "kmsdrm":
-        found = _connectors(Path("/sys/class/drm"))
-        if len(found) == count:
-            return found
-    library = ctypes.CDLL(pygame.base.__file__)  # SDL is among what it is linked with
-    library.SDL_GetDisplayName.restype = ctypes.c_char_p
-    return [(library.SDL_GetDisplayName(k) or str(k).encode()).decode() for k in range(count)]
-
-
-def _connectors(drm: Path) -> list[str]:
-    """Connectors with something plugged in ("HDMI-A-1"), in the kernel's order."""
-    connected = [
-        path.parent
-        for path in drm.glob("card*-*/status")
-        if path.read_text().strip() == "connected"
-    ]
-
-    def order(path: Path) -> tuple[str, int]:
-        number = path / "connector_id"
-        return path.name.partition("-")[0], int(number.read_text()) if number.exists() else 0
-
-    return [path.name.partition("-")[2] for path in sorted(connected, key=order)]
+            sdl.screen.leave(here)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers import dlpc350_protocol as p
 from drivers import dmd
-from drivers.base import DeviceRefused
+from drivers.base.errors import DeviceRefused
 
 KEPT = 2  # images that the board holds at once: only a third must be waited for
 

@@ -24,12 +24,7 @@ from typing import Any
 import usb.core
 import usb.util
 
-from drivers.base import (
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-)
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
 
 REPORT = 64  # bytes
 HEADER = 4

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from genicam import genapi, gentl
 
-from drivers.base import Context, DeviceLost, DeviceRefused, DeviceTimeout, Identity
+from drivers.base.device import Context, Identity
+from drivers.base.errors import DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.sfnc import Nodes, SfncCamera, SfncOptions, Value
 from drivers.streaming import Buffer
 

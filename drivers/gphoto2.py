@@ -2,9 +2,9 @@
 
 A RAW file gives the sensor's own counts, unpacked, with the mosaic named and the black level that
 the file states. A JPEG has the camera's tone curve: tell the scan, or set the camera to RAW. How
-large frames are is known only from a picture, so `connect` and `configure` take one.
-
-    closed ──connect──> idle ──start──> acquiring ──stop──> idle;  any ──close──> closed
+large frames are is known only from a picture, so `connect` takes one. A setting takes the camera's
+nearest step, if one is near. Life and settings otherwise: drivers/attached.py. A waiting grab sees
+`halt` within 50 ms; an exposure goes on to its end.
 
 Retry policy. `configure`, `start`, `stop` and `check` may be sent again; `trigger` may not. When
 a picture did not come, the next trigger first waits until the camera has been quiet for an exposure
@@ -14,8 +14,6 @@ and a second, and drops what comes: a late picture is never taken for the next o
 from __future__ import annotations
 
 import contextlib
-import threading
-from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
@@ -24,26 +22,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    Identity,
-    Options,
-)
+from drivers.attached import AttachedCamera
+from drivers.base.camera import Acquisition, CameraInfo, CameraSettings, Frame
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.clock import NS
 from drivers.gphoto2config import Config
 from drivers.imagefile import BadImage
 from drivers.rawfile import develop
-from drivers.streaming import merged
 
 SHUTTER = ("shutterspeed", "shutterspeed2", "exptime")  # what makers call it
 ISO = ("iso", "isospeed")
@@ -64,7 +50,7 @@ class GphotoOptions(Options, frozen=True, kw_only=True):
     keep: bool = False  # leave pictures on the camera's card
 
 
-class GphotoCamera(Camera):
+class GphotoCamera(AttachedCamera):
     """A camera that takes pictures one at a time. See the module. `gain` is the ISO speed."""
 
     options_type = GphotoOptions
@@ -72,15 +58,7 @@ class GphotoCamera(Camera):
 
     def __init__(self, name: str, options: GphotoOptions, context: Context) -> None:
         super().__init__(name, options, context)
-        self._halted = threading.Event()
         self._camera: Any = None
-        self._identity = Identity("")
-        self._info: CameraInfo | None = None
-        self._settings = CameraSettings()
-        self._wanted = CameraSettings()
-        self._acquisition: Acquisition | None = None
-        self._triggered: deque[tuple[int, int]] = deque()
-        self._late = False
         self._sequence = 0
 
     @classmethod
@@ -100,26 +78,6 @@ class GphotoCamera(Camera):
 
     # ------------------------------------------------------------ life
 
-    def connect(self) -> Identity:
-        """Open it, set it, and take a picture to learn what it delivers."""
-        self.close()
-        mine = self.options
-        try:
-            with self._errors("connect"):
-                self._camera, self._identity = self._open()
-                target = self._config.first(("capturetarget",))
-                if target and MEMORY in self._config.choices(target):
-                    self._config.set(target, MEMORY)
-                for name, value in mine.config.items():
-                    self._choose(name, value, "connect")
-                stated = CameraSettings(exposure_us=mine.exposure_us, gain=mine.iso)
-                self._apply(merged(stated, self._wanted), "connect")
-                self._learn("connect")
-        except BaseException:
-            self.close()
-            raise
-        return self._identity
-
     def check(self) -> None:
         """Ask for its model."""
         self._connected("check")
@@ -127,27 +85,20 @@ class GphotoCamera(Camera):
             self._camera.get_abilities()
             self._camera.get_storageinfo()
 
-    def safe(self) -> None:
-        """Stopped."""
-        self.stop()
-
-    def halt(self) -> None:
-        """See Device. A waiting grab raises within 50 ms; an exposure goes on to its end."""
-        self._halted.set()
-
-    def close(self) -> None:
-        """See Device."""
-        self.stop()
-        camera, self._camera, self._info = self._camera, None, None
-        if camera is not None:
-            with contextlib.suppress(gp.GPhoto2Error):  # it is gone: nothing to close
-                camera.exit()
-
     def facts(self) -> dict[str, Any]:
         """Identity."""
         return {"model": self._identity.model, "serial": self._identity.serial}
 
-    def _open(self) -> tuple[Any, Identity]:
+    def _open(self) -> Identity:
+        self._camera, identity = self._find()
+        target = self._config.first(("capturetarget",))
+        if target and MEMORY in self._config.choices(target):
+            self._config.set(target, MEMORY)
+        for name, value in self.options.config.items():
+            self._choose(name, value, "connect")
+        return identity
+
+    def _find(self) -> tuple[Any, Identity]:
         wanted, seen = [], []
         for model, port in _attached():
             camera = _opened(model, port)
@@ -173,27 +124,8 @@ class GphotoCamera(Camera):
 
     # ------------------------------------------------------------ settings
 
-    def info(self) -> CameraInfo:
-        """See Camera."""
-        if self._info is None:
-            raise self._refused("info", "not connected", "connect it first")
-        return self._info
-
-    def settings(self) -> CameraSettings:
-        """See Camera."""
-        self.info()
-        return self._settings
-
-    def configure(self, wanted: CameraSettings) -> CameraSettings:
-        """See Camera. Sets the camera's step that is nearest, if one is near."""
-        self._connected("configure")
-        if self._acquisition is not None:
-            raise self._refused("configure", "it is acquiring", "stop it first")
-        with self._errors("configure"):
-            self._apply(wanted, "configure")
-        self._wanted = merged(self._wanted, wanted)
-        self._settings = self._in_force()
-        return self._settings
+    def _stated(self) -> CameraSettings:
+        return CameraSettings(exposure_us=self.options.exposure_us, gain=self.options.iso)
 
     def _apply(self, wanted: CameraSettings, phase: str) -> None:
         info = self._info
@@ -247,18 +179,19 @@ class GphotoCamera(Camera):
     def _config(self) -> Config:
         return Config(self._camera)
 
-    def _in_force(self) -> CameraSettings:
+    def _take_in(self) -> None:
         info = self.info()
         seconds = self._config.number(SHUTTER)
-        return CameraSettings(
+        self._settings = CameraSettings(
             exposure_us=None if seconds is None else seconds * 1e6,
             gain=self._config.number(ISO),
             pixel_format=info.pixel_format,
             roi=(0, 0, info.width, info.height),
         )
 
-    def _learn(self, phase: str) -> None:
+    def _learn(self) -> None:
         """Take a picture and find out what pictures are like."""
+        phase = "connect"
         self._halted.clear()
         self._drain(0.0)
         self._camera.trigger_capture()
@@ -285,7 +218,7 @@ class GphotoCamera(Camera):
             gain_unit="ISO",
             triggers=("software", "hardware"),
         )
-        self._settings = self._in_force()
+        self._take_in()
 
     # ------------------------------------------------------------ acquisition
 
@@ -363,6 +296,12 @@ class GphotoCamera(Camera):
         """See Camera."""
         self._acquisition = None
 
+    def _release(self) -> None:
+        camera, self._camera = self._camera, None
+        if camera is not None:
+            with contextlib.suppress(gp.GPhoto2Error):  # it is gone: nothing to close
+                camera.exit()
+
     def _picture(self, phase: str, timeout_s: float) -> bytes:
         """The next picture's file, taken off the camera."""
         deadline = self.clock.now_ns() + round(timeout_s * NS)
@@ -405,17 +344,6 @@ class GphotoCamera(Camera):
                 return dropped
 
     # ------------------------------------------------------------ errors
-
-    def _connected(self, phase: str) -> None:
-        if self._info is None:
-            raise self._refused(phase, "not connected", "connect it first")
-
-    def _unless_halted(self, phase: str) -> None:
-        if self._halted.is_set():
-            raise self._refused(phase, "halted", "start it again")
-
-    def _refused(self, phase: str, problem: str, remedy: str) -> DeviceRefused:
-        return DeviceRefused(self.name, phase, problem, remedy)
 
     @contextlib.contextmanager
     def _errors(self, phase: str) -> Iterator[None]:

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from pypylon import genicam, pylon
 
-from drivers.base import Context, DeviceLost, DeviceRefused, DeviceTimeout, Identity
+from drivers.base.device import Context, Identity
+from drivers.base.errors import DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.sfnc import Nodes, SfncCamera, SfncOptions, Value
 from drivers.streaming import HALT_SLICE_S, Buffer
 

@@ -10,7 +10,7 @@ import rawpy
 from numpy.typing import NDArray
 
 from drivers import imagefile
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 from drivers.imagefile import BadImage
 
 

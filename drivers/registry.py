@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from drivers.base import Context, Device
+from drivers.base.device import Context, Device
 
 GROUP = "umbra.drivers"
 

@@ -26,23 +26,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import imagefile, videofile
-from drivers.base import (
-    Acquisition,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    Context,
+from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import (
     DeviceError,
     DeviceGarbled,
     DeviceLost,
     DeviceRefused,
     DeviceTimeout,
     EndOfRecording,
-    Frame,
-    Identity,
-    Options,
-    PixelFormat,
 )
+from drivers.base.pixelformat import PixelFormat
 from drivers.clock import NS
 from drivers.imagefile import BadImage, ImageHeader
 from drivers.videofile import VideoFile

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.base import Frame, LoadedSequence
+from drivers.base.camera import Frame
+from drivers.base.projector import LoadedSequence
 
 TOLERANCE = 0.25
 """Of a period: far above a trigger's jitter, far below the whole period of a slip."""

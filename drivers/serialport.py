@@ -25,7 +25,7 @@ from typing import Any
 import serial
 from serial.tools import list_ports
 
-from drivers.base import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.clock import Clock
 
 POLL_S = 0.1  # how soon a reader notices that it was closed

@@ -12,15 +12,10 @@ from typing import Any, Literal
 import msgspec
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    CameraInfo,
-    CameraSettings,
-    Context,
-    DeviceGarbled,
-    Identity,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, CameraInfo, CameraSettings
+from drivers.base.device import Context, Identity
+from drivers.base.errors import DeviceGarbled
+from drivers.base.pixelformat import PixelFormat
 from drivers.clock import NS
 from drivers.streaming import Buffer, StreamingCamera, StreamingOptions
 from drivers.unpack import Layout, Packing, layout_of

@@ -1,44 +1,29 @@
-"""What all cameras that hand out buffers share: order of calls, halting, late frames, times.
+"""What all cameras that hand out buffers share: halting, late and incomplete frames, times.
 
 A driver says how its camera is opened, set, armed and read; this module makes a Camera of it.
+Life and settings are those of drivers/attached.py.
 
-    closed ──connect──> idle ──start──> acquiring ──stop──> idle;  any ──close──> closed
     acquiring ──halt──> halted ──start, stop──> acquiring, idle
 
 Retry policy. `configure`, `start`, `stop` and `check` may be sent again. `trigger` may not: the
 camera may have exposed. When a triggered frame did not come, the acquisition is restarted before
-the next trigger, so that a late frame is never taken for the next one. After DeviceLost, call
-`connect` again: it applies the settings that were in force.
+the next trigger, so that a late frame is never taken for the next one.
 """
 
 from __future__ import annotations
 
-import contextlib
-import threading
 from abc import abstractmethod
-from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    Identity,
-    Options,
-)
+from drivers.attached import AttachedCamera
+from drivers.base.camera import Acquisition, CameraInfo, CameraSettings, Frame
+from drivers.base.device import Context, Options
+from drivers.base.errors import DeviceGarbled, DeviceTimeout
 from drivers.clock import NS
 from drivers.devicetime import DeviceTime
 from drivers.unpack import Layout, unpack
@@ -74,7 +59,7 @@ class Buffer:
     pixel_code: int | None = None  # the format's number as the frame itself has it; None: unsaid
 
 
-class StreamingCamera(Camera):
+class StreamingCamera(AttachedCamera):
     """See the module. A driver implements the methods below `what a driver adds`."""
 
     options_type: ClassVar[type[Options]] = StreamingOptions
@@ -82,28 +67,12 @@ class StreamingCamera(Camera):
 
     def __init__(self, name: str, options: StreamingOptions, context: Context) -> None:
         super().__init__(name, options, context)
-        self._halted = threading.Event()
-        self._acquisition: Acquisition | None = None
-        self._identity = Identity("")
-        self._info: CameraInfo | None = None
-        self._settings = CameraSettings()
-        self._wanted = CameraSettings()  # to be set again after a loss
-        self._triggered: deque[tuple[int, int]] = deque()  # exposures whose frames are to come
-        self._late = False  # a triggered frame did not come, and may yet
         self._incomplete = 0
         self._sequence = -1
         self._last_id: int | None = None
         self._time = DeviceTime()
 
     # ------------------------------------------------------------ what a driver adds
-
-    @abstractmethod
-    def _open(self) -> Identity:
-        """Open the camera that the options name, all automatic corrections off."""
-
-    @abstractmethod
-    def _apply(self, wanted: CameraSettings, phase: str) -> None:
-        """Change settings; everything is checked before anything is set. Raises DeviceRefused."""
 
     @abstractmethod
     def _read(self) -> tuple[CameraInfo, CameraSettings]:
@@ -133,14 +102,6 @@ class StreamingCamera(Camera):
     def _end(self) -> None:
         """Stop streaming; buffers not fetched are forgotten. Idempotent."""
 
-    @abstractmethod
-    def _release(self) -> None:
-        """Let go of the camera. Idempotent; does not raise for one that is gone."""
-
-    @abstractmethod
-    def _errors(self, phase: str) -> AbstractContextManager[None]:
-        """Turns the library's exceptions into DeviceErrors."""
-
     def _synchronise(self) -> bool:
         """Pair the camera's clock with the rig's in `_time`; False if that takes frames."""
         return False
@@ -151,38 +112,7 @@ class StreamingCamera(Camera):
     def _still_there(self, phase: str) -> None:
         """Raise DeviceLost if no frame came because there is no camera any more."""
 
-    # ------------------------------------------------------------ life
-
-    def connect(self) -> Identity:
-        """Open it, switch automatic corrections off, apply the options and the last settings."""
-        self.close()
-        mine = self.options
-        stated = CameraSettings(mine.exposure_us, mine.gain, None, mine.frame_rate_hz, mine.roi)
-        try:
-            with self._errors("connect"):
-                self._identity = self._open()
-                self._apply(merged(stated, self._wanted), "connect")
-                self._take_in()
-        except BaseException:
-            self.close()
-            raise
-        return self._identity
-
-    def safe(self) -> None:
-        """Stopped."""
-        self.stop()
-
-    def halt(self) -> None:
-        """See Device. A waiting grab or trigger raises within 20 ms; `start` clears it."""
-        self._halted.set()
-
-    def close(self) -> None:
-        """See Device."""
-        # A camera that is gone cannot be stopped: that it is gone is known already.
-        with contextlib.suppress(DeviceError):
-            self.stop()
-        self._release()
-        self._acquisition = self._info = None
+    # ------------------------------------------------------------ what it is and is set to
 
     def facts(self) -> dict[str, Any]:
         """Identity, and how many frames came incomplete."""
@@ -192,29 +122,9 @@ class StreamingCamera(Camera):
             "incomplete": self._incomplete,
         }
 
-    # ------------------------------------------------------------ settings
-
-    def info(self) -> CameraInfo:
-        """See Camera."""
-        if self._info is None:
-            raise self._refused("info", "not connected", "connect it first")
-        return self._info
-
-    def settings(self) -> CameraSettings:
-        """See Camera."""
-        self.info()
-        return self._settings
-
-    def configure(self, wanted: CameraSettings) -> CameraSettings:
-        """See Camera. Everything is checked against the camera's ranges before anything is set."""
-        self._connected("configure")
-        if self._acquisition is not None:
-            raise self._refused("configure", "it is acquiring", "stop it first")
-        with self._errors("configure"):
-            self._apply(wanted, "configure")
-            self._take_in()
-        self._wanted = merged(self._wanted, wanted)
-        return self._settings
+    def _stated(self) -> CameraSettings:
+        mine = self.options
+        return CameraSettings(mine.exposure_us, mine.gain, None, mine.frame_rate_hz, mine.roi)
 
     def _take_in(self) -> None:
         """Ask what is in force. No camera says how its shutter rolls: the options do."""
@@ -378,22 +288,3 @@ class StreamingCamera(Camera):
             self._time.observe(device_ns, start)
             start = self._time.to_rig(device_ns)
         return start, start + length
-
-    # ------------------------------------------------------------ errors
-
-    def _connected(self, phase: str) -> None:
-        if self._info is None:
-            raise self._refused(phase, "not connected", "connect it first")
-
-    def _unless_halted(self, phase: str) -> None:
-        if self._halted.is_set():
-            raise self._refused(phase, "halted", "start it again")
-
-    def _refused(self, phase: str, problem: str, remedy: str) -> DeviceRefused:
-        return DeviceRefused(self.name, phase, problem, remedy)
-
-
-def merged(under: CameraSettings, over: CameraSettings) -> CameraSettings:
-    """The settings of `over`, and where it has none those of `under`."""
-    given = {f.name: getattr(over, f.name) for f in fields(over)}
-    return replace(under, **{name: v for name, v in given.items() if v is not None})

@@ -18,19 +18,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Identity,
-    Options,
-    Stage,
-    StageInfo,
-    StageState,
-    StageStatus,
-)
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.stage import Stage, StageInfo, StageState, StageStatus
 from drivers.clock import NS
 from drivers.serialport import SerialPort, attached
 from drivers.tmcl_line import TmclLine

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 
 
 class Packing(enum.StrEnum):

@@ -12,23 +12,24 @@ import logging
 import time
 import weakref
 from collections import deque
-from collections.abc import AsyncGenerator, AsyncIterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import zmq
 import zmq.asyncio
 
-from protocol.arrivals import arrival, place_for, place_in
-from protocol.client import chosen_keys, own_name
+from protocol.aio_run import AsyncRun
+from protocol.arrivals import arrival, place_for
+from protocol.bothways import Awaited
 from protocol.commands import Commands
 from protocol.connection import (
     ATTEMPTS,
     Ask,
     Exchange,
+    GivenKeys,
     Inbox,
     Notice,
-    chosen_endpoint,
     dealer,
     events_endpoint,
     id_of,
@@ -37,18 +38,14 @@ from protocol.connection import (
     unreachable,
 )
 from protocol.errors import Code, UmbraError
-from protocol.following import SILENCE_S, Following
-from protocol.keys import ClientKeys
-from protocol.messages import Progress, RunInfo, RunState, Welcome
-from protocol.results import Separation
-from protocol.run import described, failure
-from protocol.scans import AnyScan
+from protocol.messages.replies import Welcome
+from protocol.scans.anyscan import AnyScan
 
 T = TypeVar("T")
 log = logging.getLogger("umbra")
 
 
-class AsyncClient(Commands):
+class AsyncClient(Awaited, Commands):
     """A connection to a rig, with a coroutine for each command. For one loop."""
 
     welcome: Welcome
@@ -57,15 +54,11 @@ class AsyncClient(Commands):
         self,
         endpoint: str | None = None,
         *,
-        keys: ClientKeys | Path | str | Literal[False] | None = None,
+        keys: GivenKeys = None,
         timeout_s: float = 5.0,
         name: str = "",
     ) -> None:
-        self.endpoint = chosen_endpoint(endpoint)
-        self.keys = chosen_keys(keys, self.endpoint)
-        self.timeout_s = timeout_s
-        self.name = name or own_name()
-        self.token = ""  # of the lock, while this client holds it
+        super().__init__(endpoint, keys, timeout_s, name)
         self._context = zmq.asyncio.Context()
         self._streams: weakref.WeakSet[AsyncEventStream] = weakref.WeakSet()
         self._lines: list[_Line] = []
@@ -325,91 +318,3 @@ class AsyncEventStream:
 
     async def __aexit__(self, *error: object) -> None:
         self.close()
-
-
-class AsyncRun:
-    """A run on a rig: follow it, steer it, fetch what it made. `info` is as last heard."""
-
-    def __init__(self, rig: AsyncClient, info: RunInfo) -> None:
-        self._rig = rig
-        self.info = info
-
-    @property
-    def id(self) -> str:
-        """The run's id."""
-        return self.info.id
-
-    @property
-    def state(self) -> RunState:
-        """The run's state as last heard; `refresh` asks."""
-        return self.info.state
-
-    async def refresh(self) -> RunInfo:
-        """Ask the rig how the run is."""
-        self.info = await self._rig.run_info(self.id)
-        return self.info
-
-    async def progress(self) -> AsyncGenerator[Progress, None]:
-        """How the run goes on, until it has ended: see `protocol.run.Run.progress`."""
-        following = Following(self.id)
-        async with self._rig.subscribe("run", "progress") as events:
-            news = await self._snapshot(following)
-            while True:
-                if news is not None:
-                    yield news
-                if following.ended:
-                    break
-                notice = await events.next(SILENCE_S)
-                if notice is None or following.outdated_by(notice.event):
-                    news = await self._snapshot(following)
-                else:
-                    news = following.event(notice.event)
-        await self.refresh()
-
-    async def _snapshot(self, following: Following) -> Progress | None:
-        status = await self._rig.status()
-        return following.snapshot(status, await self.refresh())
-
-    async def wait(self, timeout_s: float | None = None, *, check: bool = True) -> RunInfo:
-        """Wait until the run has ended: see `protocol.run.Run.wait`."""
-        try:
-            async with asyncio.timeout(timeout_s), contextlib.aclosing(self.progress()) as going:
-                async for _ in going:
-                    pass
-        except TimeoutError:
-            raise TimeoutError(f"run {self.id} is {self.state} after {timeout_s:g} s") from None
-        if check and self.state is not RunState.DONE:
-            raise failure(self.info)
-        return self.info
-
-    async def result(self, *, check: bool = True) -> Separation:
-        """Direct and global as they are now: see `protocol.run.Run.result`."""
-        if check and (await self.refresh()).state is RunState.FAILED:
-            raise failure(self.info)
-        return await self._rig.result(self.id)
-
-    async def facts(self) -> dict[str, Any]:
-        """The figures of the run as they are now: see `protocol.run.Run.facts`."""
-        return await self._rig.facts(self.id)
-
-    async def save(self, folder: Path | str) -> list[Path]:
-        """Fetch all products into a folder, which is made; the files written."""
-        return [
-            await self._rig.download(self.id, product.name, place_in(folder, product))
-            for product in (await self.refresh()).products
-        ]
-
-    async def pause(self) -> None:
-        """Pause after the step under way."""
-        await self._rig.pause(self.id)
-
-    async def resume(self) -> None:
-        """Go on."""
-        await self._rig.resume(self.id)
-
-    async def abort(self) -> None:
-        """End the run; what was recorded is kept."""
-        await self._rig.abort(self.id)
-
-    def __repr__(self) -> str:
-        return f"<AsyncRun {described(self.info)}>"

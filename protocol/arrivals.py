@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from protocol.errors import Code, UmbraError
-from protocol.messages import Product
+from protocol.messages.runs import Product
 
 
 class Arrival:

@@ -7,9 +7,7 @@ threads; their requests take turns. Ctrl-C ends a wait at once and leaves the cl
 from __future__ import annotations
 
 import contextlib
-import getpass
 import logging
-import socket as network
 import threading
 import time
 from collections import deque
@@ -21,27 +19,26 @@ from typing import Any, Literal, TypeVar
 import zmq
 
 from protocol.arrivals import arrival, place_for
+from protocol.bothways import Blocking
 from protocol.commands import Commands
 from protocol.connection import (
     ATTEMPTS,
     Ask,
     Exchange,
+    GivenKeys,
     Inbox,
     Notice,
-    chosen_endpoint,
     dealer,
     events_endpoint,
     id_of,
-    is_local,
     split_topics,
     subscriber,
     unreachable,
 )
 from protocol.errors import Code, UmbraError
-from protocol.keys import ClientKeys
-from protocol.messages import Welcome
+from protocol.messages.replies import Welcome
 from protocol.run import Run
-from protocol.scans import AnyScan
+from protocol.scans.anyscan import AnyScan
 
 T = TypeVar("T")
 log = logging.getLogger("umbra")
@@ -50,7 +47,7 @@ log = logging.getLogger("umbra")
 def connect(
     endpoint: str | None = None,
     *,
-    keys: ClientKeys | Path | str | Literal[False] | None = None,
+    keys: GivenKeys = None,
     timeout_s: float = 5.0,
     name: str = "",
 ) -> Client:
@@ -63,41 +60,18 @@ def connect(
     return Client(endpoint, keys=keys, timeout_s=timeout_s, name=name)
 
 
-def chosen_keys(
-    keys: ClientKeys | Path | str | Literal[False] | None, endpoint: str
-) -> ClientKeys | None:
-    """The keys given, or read from the folder given, or the default ones; False: none at all."""
-    if keys is False:
-        return None
-    if isinstance(keys, str | Path):
-        return ClientKeys.load(keys)
-    return keys or ClientKeys.default(local=is_local(endpoint))
-
-
-def own_name() -> str:
-    """Who asks, for the rig's records: user@host."""
-    try:
-        return f"{getpass.getuser()}@{network.gethostname()}"
-    except (KeyError, OSError):  # no such user: a container with a bare number
-        return network.gethostname()
-
-
-class Client(Commands):
+class Client(Blocking, Commands):
     """A connection to a rig, with a blocking method for each command."""
 
     def __init__(
         self,
         endpoint: str | None = None,
         *,
-        keys: ClientKeys | Path | str | Literal[False] | None = None,
+        keys: GivenKeys = None,
         timeout_s: float = 5.0,
         name: str = "",
     ) -> None:
-        self.endpoint = chosen_endpoint(endpoint)
-        self.keys = chosen_keys(keys, self.endpoint)
-        self.timeout_s = timeout_s
-        self.name = name or own_name()
-        self.token = ""  # of the lock, while this client holds it
+        super().__init__(endpoint, keys, timeout_s, name)
         self._turn = threading.RLock()
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._sockets: list[zmq.Socket[bytes]] = []

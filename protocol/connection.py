@@ -12,33 +12,27 @@ the last attempt the error is UNREACHABLE.
 from __future__ import annotations
 
 import contextlib
+import getpass
 import logging
 import os
 import re
+import socket as network
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 import zmq
 
 from protocol.errors import Code, UmbraError
 from protocol.keys import ClientKeys
-from protocol.messages import (
-    DEFAULT_COMMAND,
-    PROTOCOL,
-    AnyCommand,
-    AnyEvent,
-    AnyReply,
-    Event,
-    Logged,
-    PreviewTaken,
-    Reply,
-    Request,
-    Response,
-    Welcome,
-)
+from protocol.messages.access import DEFAULT_COMMAND
+from protocol.messages.commands import AnyCommand
+from protocol.messages.envelopes import PROTOCOL, Event, Request, Response
+from protocol.messages.events import AnyEvent, Logged, PreviewTaken
+from protocol.messages.replies import AnyReply, Reply, Welcome
 from protocol.wire import Arrays, arrays_of, decode, encode
 
 if TYPE_CHECKING:
@@ -56,6 +50,9 @@ PREVIEWS_HWM = 4
 _LOOPBACK = re.compile(r"localhost|127(\.\d+){3}|\[::1\]")
 
 log = logging.getLogger("umbra")
+
+GivenKeys: TypeAlias = ClientKeys | Path | str | Literal[False] | None
+"""A client's keys or their folder; None: see `ClientKeys.default`; False: none at all."""
 
 T = TypeVar("T")
 R = TypeVar("R", bound=Reply)
@@ -101,6 +98,23 @@ def is_local(endpoint: str) -> bool:
     scheme, _, rest = endpoint.partition("://")
     host = rest.rpartition(":")[0]
     return scheme == "ipc" or _LOOPBACK.fullmatch(host) is not None
+
+
+def chosen_keys(keys: GivenKeys, endpoint: str) -> ClientKeys | None:
+    """The keys given, or read from the folder given, or the default ones; False: none at all."""
+    if keys is False:
+        return None
+    if isinstance(keys, str | Path):
+        return ClientKeys.load(keys)
+    return keys or ClientKeys.default(local=is_local(endpoint))
+
+
+def own_name() -> str:
+    """Who asks, for the rig's records: user@host."""
+    try:
+        return f"{getpass.getuser()}@{network.gethostname()}"
+    except (KeyError, OSError):  # no such user: a container with a bare number
+        return network.gethostname()
 
 
 def events_endpoint(welcome: Welcome, reached: str) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from protocol import messages as m
-from protocol.messages import Progress, RunInfo, RunState
+from protocol.messages import replies
+from protocol.messages.envelopes import Event
+from protocol.messages.events import Progressed, RunChanged
+from protocol.messages.runs import Progress, RunInfo, RunState
 
 SILENCE_S = 1.0
 """Without an event for so long the rig is asked: a daemon that is gone is noticed so."""
@@ -28,7 +30,7 @@ class Following:
         """Whether there is nothing more to come."""
         return self.last is not None and self.last.state.ended
 
-    def snapshot(self, status: m.Status, info: RunInfo) -> Progress | None:
+    def snapshot(self, status: replies.Status, info: RunInfo) -> Progress | None:
         """The progress as of a snapshot, if that is news; `info` is the younger of the two."""
         self._epoch, self._held = status.epoch, dict(status.sequences)
         for there in (status.progress, status.reprocessing):
@@ -36,20 +38,20 @@ class Following:
                 return self._news(there)
         return self._news(self._of(info))
 
-    def outdated_by(self, event: m.Event) -> bool:
+    def outdated_by(self, event: Event) -> bool:
         """Whether an event shows that others were lost, or that the daemon has restarted."""
         lost = event.sequence > self._held.get(event.topic, 0) + 1
         return lost or event.epoch != self._epoch
 
-    def event(self, event: m.Event) -> Progress | None:
+    def event(self, event: Event) -> Progress | None:
         """The progress after an event, if that is news of this run."""
         if event.sequence <= self._held.get(event.topic, 0):
             return None
         self._held[event.topic] = event.sequence
         match event.body:
-            case m.Progressed(progress=progress) if progress.run == self.run:
+            case Progressed(progress=progress) if progress.run == self.run:
                 return self._news(progress)
-            case m.RunChanged(run=info) if info.id == self.run:
+            case RunChanged(run=info) if info.id == self.run:
                 return self._news(self._of(info))
         return None
 

@@ -24,7 +24,7 @@ import zmq
 from zmq.utils import z85
 
 from protocol.errors import Code, UmbraError
-from protocol.messages import Role
+from protocol.messages.access import Role
 
 SERVER = "server"
 FOLDERS = {Role.OPERATOR: "operators", Role.OBSERVER: "observers"}

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.scans import Grid
+from protocol.scans.occluded import Grid
 
 _POINTS = 20  # of a unit cell, along the pitch
 _ANGLES = 240

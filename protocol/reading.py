@@ -15,7 +15,8 @@ import msgspec
 from msgspec import inspect as shape
 
 from protocol.errors import Code, UmbraError
-from protocol.scans import AnyScan, Calibration
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.calibrations import Calibration
 
 READ = frozenset({
     # of every run

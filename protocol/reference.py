@@ -17,13 +17,21 @@ from typing import Any, get_args
 import msgspec
 from msgspec import inspect as mi
 
-from protocol import messages as m
-from protocol import patterns, scans
 from protocol.connection import ATTEMPTS, EVENTS_HWM, PREVIEWS_HWM
 from protocol.errors import Code, ErrorInfo
 from protocol.following import SILENCE_S
-from protocol.patterns import AnyBinary, AnyPattern
-from protocol.scans import AnyScan, Point, Radiometry, Ready
+from protocol.messages import commands, replies
+from protocol.messages.access import DEFAULT_COMMAND, DEFAULT_EVENTS, Role
+from protocol.messages.envelopes import PROTOCOL, ArrayHeader, Event, Request, Response
+from protocol.messages.events import AnyEvent
+from protocol.messages.findings import Check, Found, Outcome, Search
+from protocol.messages.rig import CameraSettings, DeviceInfo, Health, LockInfo, RigState, StageState
+from protocol.messages.runs import End, Product, Progress, RunInfo, RunState, Waiting
+from protocol.patterns import AnyBinary, AnyPattern, Axis
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import Grid
+from protocol.scans.spec import Radiometry, Ready, Reference
+from protocol.scans.verifications import Point
 from protocol.wire import encode
 
 CLIENT = """\
@@ -114,9 +122,9 @@ def _type(kind: mi.Type) -> str:  # noqa: PLR0911  (one case a kind of type)
 
 
 _UNIONS = {
-    "any command": m.AnyCommand,
-    "any reply": m.AnyReply,
-    "any event": m.AnyEvent,
+    "any command": commands.AnyCommand,
+    "any reply": replies.AnyReply,
+    "any event": AnyEvent,
     "any scan": AnyScan,
     "any pattern": AnyPattern,
     "a two-valued pattern": AnyBinary,
@@ -129,6 +137,27 @@ _SECTIONS = {
     "any pattern": "patterns",
     "a two-valued pattern": "patterns",
 }
+
+
+_STATES = (RunState, RigState, Health, StageState, Outcome, Role)
+_FACTS: tuple[Struct, ...] = (
+    DeviceInfo,
+    Product,
+    End,
+    RunInfo,
+    Waiting,
+    Progress,
+    LockInfo,
+    CameraSettings,
+    Found,
+    Search,
+    Check,
+    Radiometry,
+    Ready,
+    Point,
+)
+"""What is in others and has no section of its own."""
+_CHOICES = (Reference, Grid, Axis)
 
 
 def _union(structs: list[mi.StructType]) -> str:
@@ -271,31 +300,11 @@ def _enum(cls: type[enum.StrEnum]) -> Iterator[str]:
     yield ""
 
 
-def _facts() -> Iterator[Struct]:
-    """The structs inside of others that have no section of their own, in the source's order."""
-    skipped = {m.Fact, m.ArrayHeader}
-    parts = (Radiometry, Ready, Point)
-    for cls in [*vars(m).values(), *parts]:
-        if isinstance(cls, type) and (
-            (issubclass(cls, m.Fact) and cls not in skipped) or cls in parts
-        ):
-            yield cls
-
-
-def _choices() -> Iterator[type[enum.StrEnum]]:
-    """The enums that scans and patterns are made of, in the sources' order."""
-    for module in (scans, patterns):
-        for cls in vars(module).values():
-            mine = isinstance(cls, type) and cls.__module__ == module.__name__
-            if mine and issubclass(cls, enum.StrEnum):
-                yield cls
-
-
 # ---------------------------------------------------------------- the page
 
 
 def _example() -> str:
-    request = m.Request(id="5f3a9c1e", protocol=m.PROTOCOL, command=m.Hello(client="me"))
+    request = Request(id="5f3a9c1e", protocol=PROTOCOL, command=commands.Hello(client="me"))
     return bytes(encode(request)[0]).decode()
 
 
@@ -307,7 +316,7 @@ def page() -> str:
 
 def _page() -> Iterable[str]:
     yield f"""\
-# Umbra's protocol, version {m.PROTOCOL}
+# Umbra's protocol, version {PROTOCOL}
 
 <!-- Made by `python -m protocol.reference > docs/protocol.md`. Don't edit: change the structs. -->
 
@@ -318,8 +327,8 @@ it: [thirty lines](#thirty-lines) are enough for a scan.
 
 | endpoint | default | daemon | client |
 | --- | --- | --- | --- |
-| command | `{m.DEFAULT_COMMAND}` | ROUTER | DEALER, never REQ |
-| events | `{m.DEFAULT_EVENTS}` | PUB | SUB, by [topic](#events) |
+| command | `{DEFAULT_COMMAND}` | ROUTER | DEALER, never REQ |
+| events | `{DEFAULT_EVENTS}` | PUB | SUB, by [topic](#events) |
 
 `ipc://` works for both. The events endpoint is in the answer to `hello`; where its host is `*` or
 `0.0.0.0`, it is the host that was reached. Off loopback both are CURVE sockets: see [keys](#keys).
@@ -341,10 +350,10 @@ delimiter frame. Unknown fields and values out of range are refused with the pat
 ```
 
 """
-    yield from _struct(m.Request)
-    yield from _struct(m.Response)
-    yield from _struct(m.ArrayHeader)
-    yield from _struct(m.Event)
+    yield from _struct(Request)
+    yield from _struct(Response)
+    yield from _struct(ArrayHeader)
+    yield from _struct(Event)
     yield f"""\
 ## Requests
 
@@ -369,32 +378,32 @@ their own {PREVIEWS_HWM} previews; they ask when they have heard nothing for {SI
 ## States
 
 """
-    for states in (m.RunState, m.RigState, m.Health, m.StageState, m.Outcome, m.Role):
+    for states in _STATES:
         yield from _enum(states)
     yield "## Commands\n"
     yield "| command | least role | answer | |"
     yield "| --- | --- | --- | --- |"
-    for command, reply in m.ANSWERS.items():
+    for command, reply in replies.ANSWERS.items():
         first = _doc(command).partition("\n")[0]
         name = f"[`{_tag(command)}`](#{_anchor(_title(command))})"
         yield f"| {name} | {command.role.value} | {_link(reply)} | {first} |"
     yield ""
     yield "Each has a field `type`, its name.\n"
-    for command, reply in m.ANSWERS.items():
+    for command, reply in replies.ANSWERS.items():
         yield from _struct(command, f"For: {command.role.value}. Answer: {_link(reply)}.")
     yield "## Replies\n\nEach has a field `type`, its name.\n"
-    yield from _structs(m.AnyReply)
+    yield from _structs(replies.AnyReply)
     yield "## Events\n\nThe `body` of an event; each has a field `type`, its name.\n"
-    for cls in get_args(m.AnyEvent):
+    for cls in get_args(AnyEvent):
         yield from _struct(cls, f"Topic: `{cls.topic}`.")
     yield "## Scans\n\nThe `spec` of `submit`; a field `method` says which.\n"
     yield from _structs(AnyScan)
     yield "## Patterns\n\nWhat `show` shows; a field `pattern` says which.\n"
     yield from _structs(AnyPattern)
     yield "## Facts\n\nParts of the above.\n"
-    for fact in _facts():
+    for fact in _FACTS:
         yield from _struct(fact)
-    for choices in _choices():
+    for choices in _CHOICES:
         yield from _enum(choices)
     yield "## Errors\n"
     yield from _struct(ErrorInfo)

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from protocol import messages as m
 from protocol.connection import Answer, expect
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunInfo
+from protocol.messages import replies
+from protocol.messages.runs import Product, RunInfo
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,7 +58,7 @@ class Separation:
 
 def separation_of(answer: Answer) -> Separation:
     """Of a result. Raises UmbraError(no_result) for a run that measures and separates nothing."""
-    reply = expect(answer.reply, m.Result)
+    reply = expect(answer.reply, replies.Result)
     if not answer.arrays:
         raise UmbraError(
             Code.NO_RESULT,
@@ -76,14 +76,14 @@ def separation_of(answer: Answer) -> Separation:
 
 def facts_of(answer: Answer) -> dict[str, Any]:
     """The figures of a result, whatever it is."""
-    return expect(answer.reply, m.Result).facts
+    return expect(answer.reply, replies.Result).facts
 
 
 def picture_of(*names: str) -> Callable[[Answer], Picture]:
     """Of a preview or a snap, whose array has one of these names."""
 
     def made(answer: Answer) -> Picture:
-        reply = expect(answer.reply, m.Picture)
+        reply = expect(answer.reply, replies.Picture)
         name = next((n for n in names if n in answer.arrays), names[0])
         return Picture(answer.array(name), reply.facts, answer.arrays.get("saturated"))
 
@@ -92,29 +92,29 @@ def picture_of(*names: str) -> Callable[[Answer], Picture]:
 
 def run_of(answer: Answer) -> RunInfo:
     """Of an answer about one run."""
-    return expect(answer.reply, m.Run).run
+    return expect(answer.reply, replies.Run).run
 
 
 def runs_of(answer: Answer) -> tuple[RunInfo, ...]:
     """Of an answer about several runs."""
-    return expect(answer.reply, m.Runs).runs
+    return expect(answer.reply, replies.Runs).runs
 
 
-def stage_of(answer: Answer) -> m.StageStatus:
+def stage_of(answer: Answer) -> replies.StageStatus:
     """Of an answer about the stage."""
-    return expect(answer.reply, m.StageStatus)
+    return expect(answer.reply, replies.StageStatus)
 
 
 def message_of(answer: Answer) -> str:
     """What the daemon says where there is nothing more to say."""
-    return expect(answer.reply, m.Done).message
+    return expect(answer.reply, replies.Done).message
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
     """A part of a product's file."""
 
-    product: m.Product
+    product: Product
     offset: int
     size: int
     data: memoryview
@@ -122,5 +122,5 @@ class Part:
 
 def part_of(answer: Answer) -> Part:
     """Of a part of a product."""
-    reply = expect(answer.reply, m.ProductPart)
+    reply = expect(answer.reply, replies.ProductPart)
     return Part(reply.product, reply.offset, reply.size, answer.array("data", "uint8").data)

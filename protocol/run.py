@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from protocol.arrivals import place_in
 from protocol.errors import Code, UmbraError
 from protocol.following import SILENCE_S, Following
-from protocol.messages import Progress, RunInfo, RunState
+from protocol.messages.runs import Progress, RunInfo, RunState
 from protocol.results import Separation
 
 if TYPE_CHECKING:
@@ -28,11 +28,10 @@ def failure(info: RunInfo) -> UmbraError:
     return UmbraError(code, f"run {info.id} {info.state.value}: {reason}")
 
 
-class Run:
-    """A run on a rig: follow it, steer it, fetch what it made. `info` is as last heard."""
+class Known:
+    """What is known of a run: `info`, as last heard."""
 
-    def __init__(self, rig: Client, info: RunInfo) -> None:
-        self._rig = rig
+    def __init__(self, info: RunInfo) -> None:
         self.info = info
 
     @property
@@ -44,6 +43,20 @@ class Run:
     def state(self) -> RunState:
         """The run's state as last heard; `refresh` asks."""
         return self.info.state
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {described(self.info)}>"
+
+    def _repr_html_(self) -> str:
+        return f"<b>{html.escape(self.id)}</b> {html.escape(described(self.info, with_id=False))}"
+
+
+class Run(Known):
+    """A run on a rig: follow it, steer it, fetch what it made."""
+
+    def __init__(self, rig: Client, info: RunInfo) -> None:
+        super().__init__(info)
+        self._rig = rig
 
     def refresh(self) -> RunInfo:
         """Ask the rig how the run is."""
@@ -126,12 +139,6 @@ class Run:
     def abort(self) -> None:
         """End the run; what was recorded is kept."""
         self._rig.abort(self.id)
-
-    def __repr__(self) -> str:
-        return f"<Run {described(self.info)}>"
-
-    def _repr_html_(self) -> str:
-        return f"<b>{html.escape(self.id)}</b> {html.escape(described(self.info, with_id=False))}"
 
 
 def described(info: RunInfo, *, with_id: bool = True) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import msgspec
 
 from protocol.errors import Code, UmbraError
-from protocol.messages import ArrayHeader
+from protocol.messages.envelopes import ArrayHeader
 
 if TYPE_CHECKING:  # NumPy is loaded with the first array: most commands carry none
     from numpy.typing import NDArray

@@ -4,12 +4,38 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 # As many processes as cores run tests, and some start daemons: threads of a linear algebra
 # library would spin for cores that others need. Read where NumPy is first imported, here or there.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Containers often forbid bytecode; every process that a test starts would compile all of Umbra anew
+# then, which takes longer than most tests of one.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+# What is committed is fsynced, a thousand times a minute here: milliseconds on a disk, nothing in
+# memory, where there is room and a test may build a program.
+_MEMORY = Path("/dev/shm")
+if os.access(_MEMORY, os.W_OK):
+    _facts = os.statvfs(_MEMORY)
+    if _facts.f_bavail * _facts.f_frsize > 4 << 30 and not _facts.f_flag & os.ST_NOEXEC:
+        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
+
+# The same examples each time, and as slow as the machine is: a test fails for what it has found.
+settings.register_profile(
+    "umbra",
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("umbra")
 
 
 def pytest_runtest_setup() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from daemon.doctor.verdict import ok, skipped, warning
 from drivers.clock import NS, Clock, ScaledClock
-from protocol.messages import Check
+from protocol.messages.findings import Check
 
 STEP_S = 0.1
 """More than a synchronised clock is slewed by in weeks of uptime is a step."""

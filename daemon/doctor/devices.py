@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from daemon.doctor.verdict import failed, ok, warning
-from protocol.messages import Check, DeviceInfo, Health
+from protocol.messages.findings import Check
+from protocol.messages.rig import DeviceInfo, Health
 
 _REMEDIES = {
     Health.LOST: "check cable and power; it is tried again by itself",

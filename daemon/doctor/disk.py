@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from daemon.doctor.verdict import failed, ok, skipped, warning
-from protocol.messages import Check
+from protocol.messages.findings import Check
 
 _PART = 4 << 20
 _MOST = 128 << 20

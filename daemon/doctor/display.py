@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from daemon.devicethread import DeviceThread, Session
+from daemon.devices.devicethread import DeviceThread, Session
 from daemon.doctor.verdict import failed, ok, skipped, warning
-from drivers.base import DeviceRefused, Projector
+from drivers.base.errors import DeviceRefused
+from drivers.base.projector import Projector
 from drivers.clock import NS
-from protocol.messages import Check
+from protocol.messages.findings import Check
 
 FLIPS = 16
 _SHOW_S = 5.0

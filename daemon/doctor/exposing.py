@@ -8,21 +8,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from daemon.devicethread import DeviceThread, Session
+from daemon.devices.devicethread import DeviceThread, Session
 from daemon.doctor.verdict import failed, ok, skipped, warning
 from daemon.exposing.modes import whole_periods
-from drivers.base import (
-    Acquisition,
-    Camera,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    Light,
-    Projector,
-)
+from drivers.base.camera import Acquisition, Camera, Frame
+from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.light import Light
+from drivers.base.projector import Projector
 from drivers.clock import NS, Clock
 from drivers.sequence import mismatch
-from protocol.messages import Check
+from protocol.messages.findings import Check
 
 SHOTS = 4
 SETTLE_S = 0.3

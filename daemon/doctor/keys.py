@@ -8,7 +8,7 @@ from pathlib import Path
 from daemon.doctor.verdict import failed, ok, warning
 from protocol import keys as curve
 from protocol.errors import UmbraError
-from protocol.messages import Check
+from protocol.messages.findings import Check
 
 
 def keys(folder: str) -> Check:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from daemon.config import DeviceTable
 from daemon.doctor.verdict import failed, ok, skipped, warning
-from protocol.messages import Check
+from protocol.messages.findings import Check
 
 GROUPS = {"grbl": "dialout", "tmcl": "dialout", "v4l2": "video", "gphoto2": "plugdev"}
 """The group that owns a driver's device nodes on Debian and its kin."""

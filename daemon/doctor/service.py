@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from daemon.doctor.verdict import ok, skipped, warning
-from protocol.messages import Check
+from protocol.messages.findings import Check
 
 
 def watchdog(environ: Mapping[str, str], interval_s: float | None) -> Check:

@@ -8,7 +8,7 @@ from pathlib import Path
 from daemon import config
 from daemon.config import ConfigError, RigConfig
 from daemon.doctor.verdict import failed, ok, warning
-from protocol.messages import Check
+from protocol.messages.findings import Check
 
 
 def environment() -> Check:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocol.messages import Check, Outcome
+from protocol.messages.findings import Check, Outcome
 
 
 def ok(name: str, message: str) -> Check:

@@ -18,8 +18,10 @@ from typing import Any
 
 from daemon.config import SequencerSection
 from daemon.scans.method import Bench, Unsuitable
-from drivers.base import CameraInfo, SequenceLimits
-from protocol.scans import PatternScan, Spec
+from drivers.base.camera import CameraInfo
+from drivers.base.projector import SequenceLimits
+from protocol.scans.projected import PatternScan
+from protocol.scans.spec import Spec
 
 GUARDS = 2
 """A sequence begins with a white and a black image, by which its frames are known to be in step."""

@@ -5,18 +5,13 @@ from __future__ import annotations
 import numpy as np
 import structlog
 
-from daemon.devicethread import Stuck
+from daemon.devices.devicethread import Stuck
 from daemon.exposing.apparatus import CALL_S, Apparatus
-from daemon.motion import Mover
-from daemon.ring import Buffer
+from daemon.exposing.motion import Mover
+from daemon.exposing.ring import Buffer
 from daemon.scans.method import Watch
-from drivers.base import (
-    Acquisition,
-    DeviceGarbled,
-    DeviceTimeout,
-    EndOfRecording,
-    Frame,
-)
+from drivers.base.camera import Acquisition, Frame
+from drivers.base.errors import DeviceGarbled, DeviceTimeout, EndOfRecording
 from drivers.clock import NS
 
 WAY = "video"

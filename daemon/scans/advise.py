@@ -12,7 +12,8 @@ from daemon.separation.advice import Advice, Situation
 from daemon.separation.estimator import Lighting
 from daemon.separation.exposure import Settings
 from protocol.patterns import BLACK, WHITE, Checker
-from protocol.scans import Advise, Radiometry
+from protocol.scans.measuring import Advise
+from protocol.scans.spec import Radiometry
 
 
 class AdviseMethod(MeasuringMethod[Advise]):

@@ -8,7 +8,7 @@ from daemon.scans.measuring import MeasuringMethod
 from daemon.scans.method import Bench, Expose, Unsuitable
 from daemon.separation.dark import Dark
 from daemon.separation.estimator import Lighting
-from protocol.scans import CalibrateDark
+from protocol.scans.calibrations import CalibrateDark
 
 
 class DarkMethod(MeasuringMethod[CalibrateDark]):

@@ -13,7 +13,8 @@ from daemon.scans.pattern_scan import response_of
 from daemon.separation.estimator import Lighting
 from daemon.separation.latency import Latency
 from protocol.patterns import BLACK, WHITE
-from protocol.scans import CalibrateLatency, Radiometry
+from protocol.scans.calibrations import CalibrateLatency
+from protocol.scans.spec import Radiometry
 
 _GOLDEN = 0.6180339887
 

@@ -10,7 +10,8 @@ from daemon.scans.pattern_scan import response_of
 from daemon.separation.estimator import Lighting
 from daemon.separation.leak import Leak
 from protocol.patterns import BLACK, WHITE, Checker
-from protocol.scans import CalibrateLeak, Radiometry
+from protocol.scans.calibrations import CalibrateLeak
+from protocol.scans.spec import Radiometry
 
 
 class LeakMethod(MeasuringMethod[CalibrateLeak]):

@@ -11,7 +11,8 @@ from daemon.scans.pattern_scan import response_of
 from daemon.separation.estimator import Lighting
 from daemon.separation.transfer import PhotonTransfer
 from protocol.patterns import WHITE
-from protocol.scans import CalibrateNoise, Radiometry
+from protocol.scans.calibrations import CalibrateNoise
+from protocol.scans.spec import Radiometry
 
 
 class NoiseMethod(MeasuringMethod[CalibrateNoise]):

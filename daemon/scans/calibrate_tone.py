@@ -10,7 +10,8 @@ from daemon.scans.pattern_scan import response_of
 from daemon.separation.estimator import Lighting
 from daemon.separation.tone_curve import ToneCurve
 from protocol.patterns import BLACK, WHITE, Solid
-from protocol.scans import CalibrateTone, Radiometry
+from protocol.scans.calibrations import CalibrateTone
+from protocol.scans.spec import Radiometry
 
 
 class ToneMethod(MeasuringMethod[CalibrateTone]):

@@ -23,23 +23,26 @@ from daemon.scans.verify_checker_size import VerifyCheckerSizeMethod
 from daemon.scans.verify_lit_fraction import VerifyLitFractionMethod
 from daemon.scans.verify_patch_size import VerifyPatchSizeMethod
 from daemon.scans.verify_random_patterns import VerifyRandomPatternsMethod
-from protocol.scans import (
-    Advise,
-    AnyScan,
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.calibrations import (
     CalibrateDark,
     CalibrateLatency,
     CalibrateLeak,
     CalibrateNoise,
     CalibrateTone,
+)
+from protocol.scans.measuring import Advise
+from protocol.scans.occluded import Mesh, Stick
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Mesh,
     RandomBinary,
     RandomPhase,
     SingleImage,
     Sinusoid,
-    Stick,
     TwoImage,
+)
+from protocol.scans.verifications import (
     VerifyCheckerSize,
     VerifyLitFraction,
     VerifyPatchSize,

@@ -12,7 +12,7 @@ from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import FINE_PX, RankedMethod
 from daemon.separation.handedness import shift_weights
 from protocol.patterns import Checker
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 
 
 class CheckerboardMethod(RankedMethod[Checkerboard]):

@@ -10,7 +10,7 @@ from daemon.separation.estimator import Estimator
 from daemon.separation.graycode import Coded, GrayCodeDecoder
 from daemon.separation.radiometry import Response
 from protocol import patterns
-from protocol.scans import GrayCode
+from protocol.scans.projected import GrayCode
 
 
 class GrayCodeMethod(PatternMethod[GrayCode]):

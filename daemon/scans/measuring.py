@@ -7,8 +7,8 @@ from typing import TypeVar
 
 from daemon.scans.method import Bench, Expose, Method, Step, Taken, Unsuitable
 from daemon.separation.estimator import Observation
-from drivers.base import ProjectorInfo
-from protocol.scans import Measuring
+from drivers.base.projector import ProjectorInfo
+from protocol.scans.measuring import Measuring
 
 M = TypeVar("M", bound=Measuring)
 

@@ -11,8 +11,10 @@ from daemon.scans.method import Bench, Circle, Unsuitable
 from daemon.scans.occluder import OccluderMethod
 from daemon.separation.estimator import Components, Estimator
 from daemon.separation.mesh import MeshOccluder
+from daemon.separation.steadied import Steadied
 from protocol import mesh as geometry
-from protocol.scans import Mesh, Reference
+from protocol.scans.occluded import Mesh
+from protocol.scans.spec import Reference
 
 _RATE_HZ = 30.0  # where neither the scan nor the camera says
 _EXPOSURE_S = 0.01
@@ -133,10 +135,13 @@ class MeshMethod(OccluderMethod[Mesh]):
 
     def estimator(self) -> Estimator:
         """See `Method`."""
-        return MeshOccluder(
+        return Steadied(
             self.response,
-            hole_fraction=self.hole_fraction,
-            averaged=self.spec.estimator == "auto",
+            lambda: MeshOccluder(
+                self.response,
+                hole_fraction=self.hole_fraction,
+                averaged=self.spec.estimator == "auto",
+            ),
         )
 
     def conclude(self, components: Components) -> Components:

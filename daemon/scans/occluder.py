@@ -26,12 +26,13 @@ from daemon.separation.estimator import Components, Lighting, Observation
 from daemon.separation.registration import (
     LEAST_PX,
     REFERENCE,
+    Place,
     Registration,
-    Shift,
-    aligned,
 )
 from daemon.separation.strength import SourceStrength
-from protocol.scans import OccluderScan, Reference
+from daemon.separation.warping import aligned
+from protocol.scans.occluded import OccluderScan
+from protocol.scans.spec import Reference
 
 O = TypeVar("O", bound=OccluderScan)  # noqa: E741
 
@@ -177,8 +178,8 @@ class OccluderMethod(Method[O]):
     def _decide(self, pixels: NDArray[Any]) -> Observation:
         """What a complete frame of the occluder is used for; counted. Depends on nothing but the
         frames before, so that it may be done again."""
-        shift = self._shift(pixels)
-        warp = shift.warp if shift is not None and shift.found and shift.px > LEAST_PX else None
+        place = self._placed(pixels)
+        warp = place.warp if place is not None and place.found else None
         bayer = bool(self.response.bayer)
         lies = pixels if warp is None else aligned(pixels, warp, bayer)
         fresh, strength = self._weather(lies)
@@ -186,7 +187,7 @@ class OccluderMethod(Method[O]):
             why = CLOUD if strength < 1.0 else BRIGHTER
             self._rejected[why] += 1
             return Observation(used=False, reason=f"source at {strength:.0%}: {why}")
-        if shift is not None and not shift.found:
+        if place is not None and not place.found:
             self._rejected[SHAKEN] += 1
             return Observation(used=False, reason=SHAKEN)
         if self._source is not None:
@@ -194,9 +195,9 @@ class OccluderMethod(Method[O]):
             self._source.accept()
             if self._source.learned and not known and self._live:
                 fresh = LEARNED
-        if shift is None and self._learn_place(pixels):
-            fresh, shift = PLACED, self._camera.of(pixels) if self._camera else None
-            warp = shift.warp if shift is not None and shift.px > LEAST_PX else None
+        if place is None and self._learn_place(pixels):
+            fresh, place = PLACED, self._placed(pixels)
+            warp = place.warp if place is not None and place.found else None
         if fresh:
             self._rejected[fresh] += self._used
             self._used = self._aligned = 0
@@ -206,15 +207,17 @@ class OccluderMethod(Method[O]):
             strength = 1.0
         return Observation(strength=strength, warp=warp, fresh=bool(fresh), reason=fresh)
 
-    def _shift(self, pixels: NDArray[Any]) -> Shift | None:
-        """How far the camera has moved; None: that is not known (yet), or not looked for."""
+    def _placed(self, pixels: NDArray[Any]) -> Place | None:
+        """Where the camera was; None: that is not known (yet), or not looked for."""
         camera = self._camera
         if camera is None:
             return None
         if not camera.suits(pixels.shape):
             self._camera, self._place = None, "not looked for: the picture is too small"
             return None
-        return camera.of(pixels) if camera.learned else None
+        if not camera.learned:
+            return None
+        return camera.of(pixels, 1.0 if self._source is None else self._source.latest)
 
     def _learn_place(self, pixels: NDArray[Any]) -> bool:
         """Take a frame into the reference for the camera's place. True: it is known now, and the

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import ClassVar, TypeVar
 
 import cv2
@@ -24,7 +25,8 @@ from daemon.separation.order_estimate import KEEP, RANKS
 from daemon.separation.radiometry import Response
 from daemon.separation.topk import TopK
 from protocol.patterns import BLACK, WHITE, AnyPattern
-from protocol.scans import PatternScan, Radiometry, Reference
+from protocol.scans.projected import PatternScan
+from protocol.scans.spec import Radiometry, Reference
 
 FINE_PX = 64
 """Patterns of larger checkers, patches or periods may light one end of a scene alone."""
@@ -79,6 +81,12 @@ def leakage_of(radiometry: Radiometry, bench: Bench) -> float:
     if radiometry.leakage is not None:
         return radiometry.leakage
     return float((bench.calibration or {}).get("leakage", 0.0))
+
+
+@lru_cache(maxsize=128)
+def _drawn(pattern: AnyPattern, side: int) -> NDArray[np.uint8]:
+    """A pattern as it is shown: for many blurs, and for the next scan."""
+    return patterns.render(pattern, side, side)
 
 
 class PatternMethod(Method[P]):
@@ -217,7 +225,7 @@ class PatternMethod(Method[P]):
         rows, columns = rng.integers(_MARGIN, side - _MARGIN, (2, _SAMPLES))
         found = np.empty((len(self._patterns), _SAMPLES), dtype=np.float32)
         for index, pattern in enumerate(self._patterns):
-            image = patterns.render(pattern, side, side).astype(np.float32) / patterns.LEVELS
+            image = _drawn(pattern, side).astype(np.float32) / patterns.LEVELS
             if blur:
                 image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), dtype=np.float32)
             found[index] = image[rows, columns]

@@ -11,7 +11,7 @@ from daemon.scans.method import Bench, Unsuitable
 from daemon.scans.pattern_scan import FINE_PX, RankedMethod
 from daemon.separation.residue import patch_weights
 from protocol import patterns
-from protocol.scans import RandomBinary
+from protocol.scans.projected import RandomBinary
 
 
 class RandomBinaryMethod(RankedMethod[RandomBinary]):

@@ -10,7 +10,7 @@ from daemon.separation.estimator import Estimator
 from daemon.separation.radiometry import Response
 from daemon.separation.single import PeaksAndValleys
 from protocol.patterns import Stripes
-from protocol.scans import SingleImage
+from protocol.scans.projected import SingleImage
 
 
 class SingleImageMethod(PatternMethod[SingleImage]):

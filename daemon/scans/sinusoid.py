@@ -13,7 +13,7 @@ from daemon.separation.estimator import Estimator
 from daemon.separation.radiometry import Response
 from daemon.separation.sinusoid import LeastSquares
 from protocol import patterns
-from protocol.scans import RandomPhase, Sinusoid
+from protocol.scans.projected import RandomPhase, Sinusoid
 
 
 class SinusoidMethod(PatternMethod[Sinusoid]):
@@ -103,6 +103,7 @@ class RandomPhaseMethod(PatternMethod[RandomPhase]):
             response,
             phases=[(0, phase) for phase in _phases(self.spec.phases)],
             leakage=self.leakage,
+            patches=True,
         )
 
 

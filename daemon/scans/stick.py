@@ -8,9 +8,10 @@ from daemon.scans.method import Bench, Sweep, Unsuitable
 from daemon.scans.occluder import OccluderMethod
 from daemon.separation.coverage import Occluder
 from daemon.separation.estimator import Estimator
-from drivers.base import StageInfo
+from daemon.separation.steadied import Steadied
+from drivers.base.stage import StageInfo
 from protocol.patterns import Axis
-from protocol.scans import Stick
+from protocol.scans.occluded import Stick
 
 _SWEEP_S = 10.0  # of a sweep, where no feed is told
 
@@ -32,10 +33,13 @@ class StickMethod(OccluderMethod[Stick]):
 
     def estimator(self) -> Estimator:
         """See `Method`."""
-        return Occluder(
+        return Steadied(
             self.response,
-            lit_fraction=self.spec.lit_fraction,
-            averaged=self.spec.estimator == "auto",
+            lambda: Occluder(
+                self.response,
+                lit_fraction=self.spec.lit_fraction,
+                averaged=self.spec.estimator == "auto",
+            ),
         )
 
 

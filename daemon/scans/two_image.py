@@ -11,7 +11,7 @@ from daemon.separation.light_model import complement_determinants
 from daemon.separation.pair import ComplementPair
 from daemon.separation.radiometry import Response
 from protocol.patterns import Checker
-from protocol.scans import TwoImage
+from protocol.scans.projected import TwoImage
 
 _LEAST_DETERMINANT = 0.05
 """Noise grows with 1/determinant: below this, twenty-fold."""

@@ -16,7 +16,8 @@ from daemon.separation.graycode import Coded
 from daemon.separation.verification import REACH, Anchors, Reading, Source, Spot
 from daemon.separation.verification import Verification as PointReadings
 from protocol.patterns import BLACK, WHITE, AnyPattern, Axis, GrayCode
-from protocol.scans import Radiometry, Verification
+from protocol.scans.spec import Radiometry
+from protocol.scans.verifications import Verification
 
 V = TypeVar("V", bound=Verification)
 

@@ -9,7 +9,7 @@ from daemon.separation import criteria
 from daemon.separation.estimator import Measurement
 from daemon.separation.verification import Anchors, Reading
 from protocol.patterns import AnyPattern, Checker, Unlit
-from protocol.scans import VerifyCheckerSize
+from protocol.scans.verifications import VerifyCheckerSize
 
 
 class VerifyCheckerSizeMethod(VerificationMethod[VerifyCheckerSize]):

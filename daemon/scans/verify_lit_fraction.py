@@ -9,7 +9,7 @@ from daemon.separation import criteria
 from daemon.separation.estimator import Measurement
 from daemon.separation.verification import Anchors, Reading
 from protocol.patterns import AnyPattern, RandomBinary, Unlit
-from protocol.scans import VerifyLitFraction
+from protocol.scans.verifications import VerifyLitFraction
 
 _IMAGES = 100
 """Patches are lit in a part of so many images, of which each fraction shows another one."""

@@ -9,7 +9,7 @@ from daemon.separation import criteria
 from daemon.separation.estimator import Measurement
 from daemon.separation.verification import Anchors, Reading
 from protocol.patterns import WHITE, AnyPattern, Unlit
-from protocol.scans import VerifyPatchSize
+from protocol.scans.verifications import VerifyPatchSize
 
 
 class VerifyPatchSizeMethod(VerificationMethod[VerifyPatchSize]):

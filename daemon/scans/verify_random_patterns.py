@@ -9,7 +9,7 @@ from daemon.separation import criteria
 from daemon.separation.estimator import Measurement
 from daemon.separation.verification import Anchors, Reading
 from protocol.patterns import AnyPattern, RandomBinary, Unlit
-from protocol.scans import VerifyRandomPatterns
+from protocol.scans.verifications import VerifyRandomPatterns
 
 
 class VerifyRandomPatternsMethod(VerificationMethod[VerifyRandomPatterns]):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.blur import of_optics, of_wave
-from daemon.separation.contrast import CheckerContrast
+from daemon.separation.contrast import CheckerSweep
 from daemon.separation.estimator import (
     Curve,
     Lighting,
@@ -26,9 +26,9 @@ from daemon.separation.estimator import (
     Observation,
     Plot,
 )
-from daemon.separation.exposure import Setting, Settings, filling
+from daemon.separation.exposure import BRIGHTEST, Setting, Settings, filling
 from daemon.separation.radiometry import Plane, Response
-from daemon.separation.sampling import Mask, Moments, Turns, bright
+from daemon.separation.sampling import Mask, Moments
 
 _RESOLVED = 0.95  # of the largest size's contrast: a size that has it tells pixel from pixel
 _PEAK = 0.85  # of full scale: where the brightest part of the scene should be
@@ -64,54 +64,32 @@ class Advice:
     ) -> None:
         self._response = response
         self._sizes = sizes
-        self._ends = np.cumsum(images)
         self._situation = situation
-        self._references = {kind: Moments() for kind in Lighting}
-        self._turns = Turns()
-        self._contrast = CheckerContrast(response)
-        self._saturated: Mask | None = None
         self._planes: list[Plane] = []
-        self._sign: Plane | None = None
+        self._sweep = CheckerSweep(response, images, lambda _, plane: self._planes.append(plane))
+        self._white = Moments()
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Estimator`."""
-        if observation.lighting is not Lighting.PATTERN:
-            if observation.used:
-                self._references[observation.lighting].add(self._response.linear(pixels))
-                if observation.lighting is Lighting.WHITE:
-                    saturated = pixels >= self._response.saturated_from
-                    known = self._saturated
-                    self._saturated = saturated if known is None else known | saturated
-            return
-        if (overdue := self._turns.overdue(observation)) is not None:
-            self._end(overdue)
-        if observation.used:
-            self._contrast.add(pixels)
-        if observation.last:
-            self._end(observation.pattern)
-
-    def _end(self, pattern: int) -> None:
-        self._contrast.end_of_pattern()
-        if pattern + 1 in self._ends:
-            self._planes.append(self._contrast.take())
-            self._sign = self._contrast.sign
+        self._sweep.update(pixels, observation)
+        if observation.lighting is Lighting.WHITE and observation.used:
+            self._white.add(self._response.linear(pixels))
 
     # ------------------------------------------------------------ results
 
     def result(self) -> Measurement:
         """See `Estimator`. Raises NotYet before all sizes are in."""
-        if len(self._planes) < len(self._sizes) or self._saturated is None or self._sign is None:
+        saturated, sign = self._sweep.references.white_saturated, self._sweep.sign
+        if len(self._planes) < len(self._sizes) or saturated is None or sign is None:
             raise NotYet(f"{len(self._planes)} of {len(self._sizes)} sizes have been taken")
-        ambient = self._references[Lighting.AMBIENT].mean()
-        white = self._references[Lighting.WHITE].mean()
-        good = bright(ambient, white, self._saturated)
+        _, white, good = self._sweep.lit()
         full = self._response.linear_full_scale
         sizes = np.asarray(self._sizes, dtype=np.float64)
         direct = self._direct(good)
         kept = self._kept(good, direct)
         blur, local, level = self._errors(good, kept, full)
-        setting, light = self._exposure(white, full)
-        variance = self._references[Lighting.WHITE].variance()[good]
+        setting, light = self._exposure(white, saturated, full)
+        variance = self._white.variance()[good]
         noise = float(np.sqrt(variance.mean(dtype=np.float64))) / full  # of a frame, full scale
         total = np.sqrt(blur**2 + local**2)
         # Of sizes that are about as good the finest: what is too coarse is not always seen.
@@ -125,7 +103,7 @@ class Advice:
         total = setting.level * total
         periods = self._periods(kept, 2 * size, setting.level * level)
         images = _images(later, self._situation.error, len(periods))
-        scale = self._scale(good)
+        scale = self._scale(sign, good)
         limits = [
             ("camera resolution" if scale > size / 4 else "projector blur", float(blur[best])),
             ("local scattering", float(local[best])),
@@ -237,21 +215,18 @@ class Advice:
             local.append(float(np.sqrt(np.sum(grown**2) / excess.size)) * scale)
         return blur, np.asarray(local), level
 
-    def _exposure(self, white: Plane, full: float) -> tuple[Setting, str]:
+    def _exposure(self, white: Plane, saturated: Mask, full: float) -> tuple[Setting, str]:
         """What lets the scene fill the scale, and what there is to say."""
-        assert self._saturated is not None
-        hot = float(np.mean(self._saturated))
-        if hot > 0.001:
+        hot = float(np.mean(saturated))
+        if hot > BRIGHTEST:
             factor, said = 0.5, f"{hot:.1%} of the pixels are saturated under white"
         else:
-            peak = float(np.quantile(white, 0.999)) / full
+            peak = float(np.quantile(white, 1.0 - BRIGHTEST)) / full
             factor, said = _PEAK / max(peak, 1e-3), f"white reaches {peak:.0%} of the scale"
         return filling(self._situation.settings, factor), said
 
-    def _scale(self, good: Mask) -> float:
+    def _scale(self, sign: Plane, mask: Mask) -> float:
         """Projector pixels that a camera pixel spans, from how often large checkers change."""
-        assert self._sign is not None
-        sign, mask = self._sign, good
         step = 2 if self._response.bayer else 1  # in a mosaic, from one colour to the same
         both = mask[:, step:] & mask[:, :-step]
         if not both.any():

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import exp, pi
+from math import pi
 
 import numpy as np
+from numpy.typing import NDArray
 
 _TOLD = 4
 """Contrast up to this size tells the blur: that of larger checkers is lost to local scattering."""
@@ -27,9 +28,19 @@ def of_optics(contrast: Mapping[int, float]) -> float:
 
 
 def of_wave(sigma: float, period: float, weave: float = 0.0) -> float:
-    """What a blur leaves of the amplitude of sin(x + weave sin y): exp(-2π²σ²f²), with the mean
-    square of the wave's frequency, which the weave makes higher along the other axis."""
-    return exp(-2.0 * pi**2 * sigma**2 * (1.0 + 0.5 * weave**2) / period**2)
+    """What a blur leaves of the amplitude of sin(x + weave sin y), its mean over y: without a weave
+    exp(-2π²σ²f²)."""
+    return float(np.mean(np.abs(blurred_wave(sigma / period, weave))))
+
+
+def blurred_wave(sigma: float, weave: float, shift: float = 0.0) -> NDArray[np.complex128]:
+    """What a blur, in periods, leaves of exp(i weave sin(y + shift)) beside exp(ix), at 256 places
+    of a period along y: of each of its harmonics along y, a Gaussian takes its own part."""
+    y = np.arange(256) * (2.0 * pi / 256)
+    order = np.fft.fftfreq(256, 1 / 256)
+    left = np.fft.fft(np.exp(1j * weave * np.sin(y)))
+    left *= np.exp(-2.0 * pi**2 * sigma**2 * (1.0 + order**2) + 1j * order * shift)
+    return np.asarray(np.fft.ifft(left))
 
 
 def _fitted(contrast: Mapping[int, float], per_pixel: int) -> float:

@@ -1,13 +1,18 @@
-"""The contrast of checkers, free of what noise adds to the largest of several samples."""
+"""The contrast of checkers, free of what noise adds to the largest of several samples; and a sweep
+of their sizes."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.estimator import Lighting, NotYet, Observation
 from daemon.separation.radiometry import FrameMean, Plane, Response
+from daemon.separation.references import References
+from daemon.separation.sampling import Mask, Turns, bright
 
 
 class CheckerContrast:
@@ -61,3 +66,53 @@ class CheckerContrast:
             size = np.where(better, size, self._best[0])
             contrast = np.where(better, contrast, self._best[1])
         self._best = size, contrast
+
+
+class CheckerSweep:
+    """References, then checkers of one size after the other, each followed by its complement.
+
+    Patterns are numbered through; size k has `images[k]` of them. When its last has come,
+    `on_size(k, contrast)` is called. Memory: eight planes, and one a kind of reference.
+    """
+
+    def __init__(
+        self, response: Response, images: tuple[int, ...], on_size: Callable[[int, Plane], None]
+    ) -> None:
+        self.references = References(response)
+        self._contrast = CheckerContrast(response)
+        self._turns = Turns()
+        self._ends = np.cumsum(images)
+        self._on_size = on_size
+
+    @property
+    def sign(self) -> Plane | None:
+        """Of the first pattern of the size under way, or of the last: which samples it lit."""
+        return self._contrast.sign
+
+    def lit(self) -> tuple[Plane, Plane, Mask]:
+        """Ambient light, light under white, and which samples tell the two well apart: see
+        `bright`. Raises NotYet without such references."""
+        ambient, white = (self.references.mean(k) for k in (Lighting.AMBIENT, Lighting.WHITE))
+        saturated = self.references.white_saturated
+        if ambient is None or white is None or saturated is None:
+            raise NotYet("checkers are measured against source-off and white frames: none came")
+        return ambient, white, bright(ambient, white, saturated)
+
+    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
+        """See `Estimator`."""
+        if observation.lighting is not Lighting.PATTERN:
+            if observation.used:
+                self.references.add(pixels, observation.lighting)
+            return
+        if (overdue := self._turns.overdue(observation)) is not None:
+            self._end(overdue)
+        if observation.used:
+            self._contrast.add(pixels)
+        if observation.last:
+            self._end(observation.pattern)
+
+    def _end(self, pattern: int) -> None:
+        self._contrast.end_of_pattern()
+        if pattern + 1 in self._ends:
+            number = int(np.searchsorted(self._ends, pattern, side="right"))
+            self._on_size(number, self._contrast.take())

@@ -29,12 +29,12 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import Judgement, bits, finish
-from daemon.separation.noise import TemporalNoise, noise_range
+from daemon.separation.noise import Noise, TemporalNoise, noise_range
 from daemon.separation.order import Ranked
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
-from daemon.separation.registration import placed
 from daemon.separation.sweeping import Sweeping
+from daemon.separation.warping import without
 
 CELL = 8
 """Side of a cell, in pixels: its mean has an eighth of a pixel's noise."""
@@ -91,8 +91,13 @@ class Occluder:
         self._last: tuple[NDArray[Any], Plane] | None = None
         self._moved = False  # the last frame was interpolated
 
-    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """See `Estimator`."""
+    def update(
+        self,
+        pixels: NDArray[Any],
+        observation: Observation,
+        left_out: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """See `Extremes`."""
         if not observation.used:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
@@ -101,20 +106,17 @@ class Occluder:
             if observation.fresh:
                 self._unused += self._low.frames
                 self._begin()
-            moved = observation.warp is not None
-            if observation.warp is not None:
-                first = self._low.frames == 0
-                known = None if first else (self._high.planes[0], self._low.planes[0])
-                pixels = placed(pixels, observation.warp, bool(self._response.bayer), known)
             pixels = self._response.scaled(pixels, 1.0 / observation.strength)
-            self._low.add(pixels)
-            self._high.add(pixels)
+            known = (self._high.planes[0], self._low.planes[0]) if self._low.frames else None
+            told = without(pixels, left_out, known)
+            self._low.add(told)
+            self._high.add(told)
             frames = self._high.frames
-            if frames & (frames - 1) == 0 and (noise := self._pixel_noise.noise()) is not None:
+            if frames & (frames - 1) == 0 and (noise := self.noise()) is not None:
                 self._table = noise.deviation(np.arange(self._response.full_scale + 1))
-            self._lit.add(pixels, self._high.planes[1], self._low.planes[0], self._table)
+            self._lit.add(told, self._high.planes[1], self._low.planes[0], self._table)
             self._sweeping.add(pixels)
-            self._watch(pixels, moved)
+            self._watch(pixels, observation.warp is not None)
 
     def _watch(self, pixels: NDArray[Any], moved: bool) -> None:
         """Keep what tells of noise and of the shadow's way."""
@@ -131,6 +133,14 @@ class Occluder:
             self._cell_noise.add(self._last[1], cells)
         self._last, self._moved = (sample, cells), moved
 
+    def brightest(self) -> NDArray[Any] | None:
+        """See `Extremes`."""
+        return self._high.planes[0] if self._high.frames else None
+
+    def noise(self) -> Noise | None:
+        """See `Extremes`."""
+        return self._pixel_noise.noise()
+
     def result(self) -> Components:
         """See `Estimator`. Raises NotYet before two frames are in."""
         frames = self._low.frames
@@ -138,7 +148,7 @@ class Occluder:
             raise NotYet(f"an occluder's sweep needs 2 frames, {frames} came so far")
         low = self._response.linear(self._low.planes)
         high = self._response.linear(self._high.planes)
-        pixel_noise = self._pixel_noise.noise()
+        pixel_noise = self.noise()
         deviation = self._response.deviation(pixel_noise, self._high.planes[0])
         cells = self._cells(frames)
         seen = self._seen(low, high, deviation, frames, cells)

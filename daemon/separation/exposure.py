@@ -1,14 +1,38 @@
-"""Which exposure and gain fill the camera's scale, and what that does to noise."""
+"""Which exposures may be chosen; which one, with which gain, fills the camera's scale, and what
+that does to noise. `daemon.separation.metering` chooses by pictures instead."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import floor, log10
+from math import ceil, floor, log10
 
 LONGEST_US = 1e6
-"""Beyond a second light and scene are seldom still enough; gain has to do the rest."""
+"""Beyond a second light and scene are seldom still enough: no longer one is chosen unasked."""
+BRIGHTEST = 0.001
+"""Share of a picture's samples that may be brighter than its level, and so may saturate."""
+
 _ALIKE = 0.1
 """A change by less than this part is not worth another setting."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Which exposures may be chosen. `period_us`: only whole numbers of it, where one fits; with
+    `briefly` also what is shorter than one."""
+
+    shortest_us: float
+    longest_us: float
+    period_us: float | None = None
+    briefly: bool = False
+
+    def allowed(self, wanted_us: float) -> float:
+        """The longest exposure that may be chosen and is no longer than wanted, else the least."""
+        exposure = min(max(wanted_us, self.shortest_us), self.longest_us)
+        period = self.period_us
+        if period is None or period > self.longest_us or (self.briefly and exposure < period):
+            return exposure
+        periods = max(floor(exposure / period + 1e-6), ceil(self.shortest_us / period), 1)
+        return periods * period
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +86,10 @@ def filling(now: Settings, factor: float) -> Setting:
     """
     least, most = now.amplifications
     wanted = factor * now.exposure_us * now.amplification  # exposure times amplification
-    low, high = now.exposure_range_us
-    exposure = min(max(wanted / least, low), high, max(now.exposure_us, LONGEST_US))
+    shortest, longest = now.exposure_range_us
+    longest = min(longest, max(now.exposure_us, LONGEST_US))
     period = 1e6 / now.refresh_hz
-    if exposure >= period:
-        exposure = floor(exposure / period + 1e-6) * period
+    exposure = Limits(shortest, longest, period, briefly=True).allowed(wanted / least)
     amplification = min(max(wanted / exposure, least), most)
     if amplification < 2.0 * least and exposure + period < LONGEST_US:
         amplification = least  # what the rounding to whole refreshes took is not worth a gain

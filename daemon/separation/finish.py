@@ -56,6 +56,9 @@ UNUSABLE = 0.5
 _LIT = 0.05
 """Of the light of the brightest hundredth: a pixel with less is not lit at all."""
 
+_HIDDEN = 0.2
+"""Of a pixel's light: where noise may pass for so much direct light, noise is what hides it."""
+
 _BINS = 64
 
 
@@ -116,7 +119,7 @@ def finish(
         "advice": [
             *facts.get("advice", ()),
             *_advice(counted),
-            *_unusable(quality, counted, brightest),
+            *_unusable(quality, counted, brightest, judgement, flags),
         ],
         "noise_counts": round(float(np.nanmedian(judgement.deviation)), 4),
         "black_level": response.black,
@@ -184,22 +187,41 @@ def _advice(counted: dict[str, dict[str, float]]) -> list[str]:
 
 
 def _unusable(
-    quality: NDArray[np.uint16], counted: dict[str, dict[str, float]], brightest: Plane
+    quality: NDArray[np.uint16],
+    counted: dict[str, dict[str, float]],
+    brightest: Plane,
+    judgement: Judgement,
+    flags: NDArray[np.uint16] | None,
 ) -> list[str]:
-    """A line where most of the pixels that are lit at all came to nothing, and no other says so."""
+    """A line where most of the pixels that are lit at all came to nothing, and no other says so:
+    what most of them lack."""
     if counted["low_modulation"]["fraction"] > ADVICE[Quality.LOW_MODULATION][0]:
         return []
     nothing = Quality.DARK | Quality.LOW_MODULATION | Quality.NEVER_LIT | Quality.NEVER_UNLIT
     # By light and not by DARK: where noise is taken for more than it is, all is dark.
     lit = _some(brightest > np.float32(_LIT) * np.quantile(brightest, 0.99))
-    lost = int(np.count_nonzero(lit & (quality & np.uint16(nothing) != 0)))
-    part = lost / max(int(np.count_nonzero(lit)), 1)
+    lost = lit & (quality & np.uint16(nothing) != 0)
+    count = int(np.count_nonzero(lost))
+    part = count / max(int(np.count_nonzero(lit)), 1)
     if part <= UNUSABLE:
         return []
+    said = f"{part:.1%} of the pixels that are lit at all cannot be separated"
+    noisy = lost & _every(judgement.direct > np.float32(_HIDDEN) * brightest)
+    if np.count_nonzero(noisy) > count / 2:
+        return [
+            f"{said}: noise hides what direct light they may have; expose longer, or average more "
+            "frames (--average)"
+        ]
+    if flags is not None:
+        at_edges = lost & (flags & np.uint16(Quality.LOW_MODULATION) != 0)
+        if np.count_nonzero(at_edges) > count / 2:
+            return [
+                f"{said}: they lie at edges of the pattern, where no image shows them wholly lit "
+                "(or the images are not of one pattern); shifts of a checkerboard light every pixel"
+            ]
     return [
-        f"{part:.1%} of the pixels that are lit at all cannot be separated (low modulation, dark, "
-        "never lit or never unlit): see that the frames are this method's, in order, and that "
-        "patterns or shadow reach all that the camera sees"
+        f"{said} (low modulation, dark, never lit or never unlit): see that the frames are this "
+        "method's, in order, and that patterns or shadow reach all that the camera sees"
     ]
 
 

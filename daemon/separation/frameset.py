@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation, Result
+from daemon.separation.mosaic import orders_of
 from daemon.separation.radiometry import Plane, Response
 
 _SAMPLES = 20_000
@@ -30,6 +31,10 @@ _STEP_ERRORS = 5.0
 _UNEQUAL = 0.05  # of a pair's light, from pair to pair
 _SAME = 0.35  # of the usual difference of two frames in a row: below it they are one pattern
 _MOST_NAMED = 5
+_BRIGHT = {Lighting.WHITE, Lighting.PATTERN}
+_LOOK = 1024  # pixels a side that are looked at for a mosaic
+_DEPTHS = (10, 12, 14)  # bits that files of 16 hold
+_PILED = 1e-3  # of all samples, at the largest count of any: light is not so often the same
 
 
 UNCHECKED = (
@@ -38,6 +43,50 @@ UNCHECKED = (
     "by (of photographs: --black-frame, --white-frame; of a scan: --references)"
 )
 """Advice where patterns are all that there is."""
+
+
+class Ceiling:
+    """The largest count of all samples, and how many have it."""
+
+    def __init__(self) -> None:
+        self._largest = -1
+        self._there = 0
+        self._samples = 0
+
+    def add(self, sample: NDArray[Any]) -> None:
+        """Take in samples of a frame, as the camera gave them."""
+        largest = int(sample.max())
+        if largest > self._largest:
+            self._largest, self._there = largest, 0
+        self._samples += sample.size
+        self._there += int(np.count_nonzero(sample == self._largest))
+
+    def told(self, response: Response) -> list[str]:
+        """A line where a camera's scale seems to end below the one that is assumed."""
+        if response.full_scale < 65535 or self._largest >= response.saturated_from:
+            return []
+        if self._there > _PILED * self._samples:
+            part = self._there / self._samples
+            return [
+                f"{part:.1%} of the samples have the largest count of all, {self._largest}, as "
+                "where a camera's scale ends: say so "
+                f"({_depth(self._largest) or f'--saturation {self._largest}'}), for there light is "
+                "beyond it, and what follows is wrong"
+            ]
+        depth = _depth(self._largest, ends=False)
+        if depth and response.saturation is None:
+            return [
+                f"no sample is above {self._largest} of {response.full_scale}: if the camera has "
+                f"fewer bits than its files say so ({depth}), for saturation and tone curves are "
+                "taken to be those of 16; else expose longer"
+            ]
+        return []
+
+
+def _depth(largest: int, *, ends: bool = True) -> str:
+    """The option for a camera whose scale ends at this count, or (not `ends`) above it."""
+    bits = next((n for n in _DEPTHS if largest < 1 << n), 16)
+    return f"--depth {bits}" if bits < 16 and (not ends or largest == (1 << bits) - 1) else ""
 
 
 class FrameSet:
@@ -54,11 +103,16 @@ class FrameSet:
         self._copies: list[tuple[int, int]] = []
         self._last: tuple[int, Plane] | None = None
         self._steps: dict[tuple[int, int], float] = {}  # differences of frames in a row
+        self._ceiling = Ceiling()
+        self._mosaic: tuple[str, ...] | None = None  # that the first frame looks like
 
     def add(self, pixels: NDArray[Any], observation: Observation) -> None:
         """Take in a frame that is used."""
         step = max(1, int(np.sqrt(pixels.shape[0] * pixels.shape[1] / _SAMPLES)) | 1)
         sample = np.ascontiguousarray(pixels[::step, ::step])
+        self._ceiling.add(sample)
+        if self._mosaic is None and observation.lighting in _BRIGHT:
+            self._mosaic = orders_of(pixels[:_LOOK, :_LOOK]) if pixels.ndim == 2 else ()
         light = self._response.linear(sample)
         level = float(light.mean(dtype=np.float64))
         if observation.lighting is not Lighting.PATTERN:
@@ -83,7 +137,13 @@ class FrameSet:
 
     def told(self) -> tuple[dict[str, Any], list[str], list[str]]:
         """Facts, lines of advice, and what is to be said after all other advice."""
-        lines = [*self._copied(), *self._swapped()]
+        lines = [*self._copied(), *self._swapped(), *self._ceiling.told(self._response)]
+        if self._mosaic and self._response.bayer not in self._mosaic:
+            other = f", and not {self._response.bayer}" if self._response.bayer else ""
+            lines.append(
+                f"the frames look like a colour mosaic's that begins {' or '.join(self._mosaic)}"
+                f"{other}: say so (--bayer)"
+            )
         last = [] if self._references else [UNCHECKED]
         facts: dict[str, Any] = {}
         if self._even and len(self._levels) >= 2:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import blur
-from daemon.separation.contrast import CheckerContrast
+from daemon.separation.contrast import CheckerSweep
 from daemon.separation.estimator import (
     Curve,
     Lighting,
@@ -17,8 +17,8 @@ from daemon.separation.estimator import (
     Observation,
     Plot,
 )
-from daemon.separation.radiometry import FrameMean, Plane, Response
-from daemon.separation.sampling import Mask, Turns, bright, median_ratio, ratio
+from daemon.separation.radiometry import Plane, Response
+from daemon.separation.sampling import Mask, median_ratio, ratio
 
 _RESOLVED = 0.5
 """A size whose contrast is less than this part of the largest's is not resolved."""
@@ -41,46 +41,20 @@ class Leak:
 
     def __init__(self, response: Response, sizes: tuple[int, ...], images: tuple[int, ...]) -> None:
         """`sizes` descend; `images` of each."""
-        self._response = response
         self._sizes = sizes
-        self._ends = np.cumsum(images)
-        self._references = {kind: FrameMean(response) for kind in Lighting}
-        self._turns = Turns()
-        self._pairs = CheckerContrast(response)
-        self._saturated: Mask | None = None
+        self._sweep = CheckerSweep(response, images, self._close)
+        self._references = self._sweep.references
         self._good: Mask | None = None
         self._largest: Plane | None = None
         self._contrast: dict[int, tuple[float, float]] = {}
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Estimator`."""
-        if observation.lighting is not Lighting.PATTERN:
-            if observation.used:
-                self._references[observation.lighting].add(pixels)
-                if observation.lighting is Lighting.WHITE:
-                    saturated = pixels >= self._response.saturated_from
-                    known = self._saturated
-                    self._saturated = saturated if known is None else known | saturated
-            return
-        if (overdue := self._turns.overdue(observation)) is not None:
-            self._end(overdue)
-        if observation.used:
-            self._pairs.add(pixels)
-        if observation.last:
-            self._end(observation.pattern)
-
-    def _end(self, pattern: int) -> None:
-        self._pairs.end_of_pattern()
-        if pattern + 1 in self._ends:
-            number = int(np.searchsorted(self._ends, pattern, side="right"))
-            self._close(number, self._pairs.take())
+        self._sweep.update(pixels, observation)
 
     def _close(self, number: int, contrast: Plane) -> None:
         if self._largest is None:
-            ambient, white = self._ambient(), self._references[Lighting.WHITE].value()
-            if self._saturated is None:
-                raise ValueError("patches are measured against references, which come first")
-            good = bright(ambient, white, self._saturated)
+            ambient, white, good = self._sweep.lit()
             self._good = good & (contrast > _DIRECT * (white - ambient))
             self._largest = contrast
             if np.count_nonzero(self._good) < 64:
@@ -91,16 +65,12 @@ class Leak:
         assert self._good is not None
         self._contrast[self._sizes[number]] = median_ratio(contrast, self._largest, self._good)
 
-    def _ambient(self) -> Plane:
-        return self._references[Lighting.AMBIENT].value()
-
     def result(self) -> Measurement:
         """See `Estimator`. Raises NotYet before all sizes are in."""
-        if len(self._contrast) < len(self._sizes) or self._saturated is None:
+        black = self._references.mean(Lighting.BLACK)
+        if len(self._contrast) < len(self._sizes) or black is None:
             raise NotYet(f"{len(self._contrast)} of {len(self._sizes)} sizes have been taken")
-        ambient = self._ambient()
-        black, white = (self._references[k].value() for k in (Lighting.BLACK, Lighting.WHITE))
-        good = bright(ambient, white, self._saturated)
+        ambient, white, good = self._sweep.lit()
         b, b_sd = ratio(black - ambient, white - ambient, good)
         b_sd = float(np.hypot(np.nan_to_num(b_sd), self._uncertain_black(white - ambient, good)))
         rows = [self._of_size(size, b, b_sd) for size in sorted(self._sizes)]
@@ -170,7 +140,7 @@ class Leak:
 
     def _uncertain_black(self, whole: Plane, good: Mask) -> float:
         """What the rounding of counts may do to b, where it is the same in all samples."""
-        frames = max(1, self._references[Lighting.BLACK].frames)
+        frames = max(1, self._references.frames(Lighting.BLACK))
         mean = float(whole[good].mean(dtype=np.float64))
         return 0.29 / mean / float(np.sqrt(frames))
 

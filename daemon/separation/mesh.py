@@ -25,8 +25,8 @@ from daemon.separation.noise import Noise
 from daemon.separation.plateau import BAND, WHOLE, Part, Plateaus, spread
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
-from daemon.separation.registration import placed
 from daemon.separation.still import StillPlaces
+from daemon.separation.warping import without
 
 LEAST_MODULATION = 0.05
 """A smaller part of the light comes and goes with interreflection while the mesh moves."""
@@ -74,11 +74,17 @@ class MeshOccluder:
         self._table: Plane | None = None
         self._mean: NDArray[np.float64] | None = None  # of the sampled pixels' linear light
         self._last: NDArray[Any] | None = None
+        self._left_out: NDArray[np.uint16] | None = None  # frames that tell nothing of a pixel
         self._followed = 0  # frames when coverage was last looked at
         self._share = 0.0
 
-    def update(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """See `Estimator`."""
+    def update(
+        self,
+        pixels: NDArray[Any],
+        observation: Observation,
+        left_out: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """See `Extremes`."""
         if not observation.used:
             self._unused += 1
         elif observation.lighting is not Lighting.PATTERN:
@@ -87,14 +93,14 @@ class MeshOccluder:
             if observation.fresh and self._last is not None:
                 self._unused += self._plateaus.frames
                 self._begin()
-            moved = observation.warp is not None
-            if observation.warp is not None:
-                high, low = self._plateaus.high, self._plateaus.low
-                known = (high.extreme, low.extreme) if self._plateaus.frames else None
-                pixels = placed(pixels, observation.warp, bool(self._response.bayer), known)
-            self._take(self._response.scaled(pixels, 1.0 / observation.strength), moved)
+            pixels = self._response.scaled(pixels, 1.0 / observation.strength)
+            self._take(pixels, observation.warp is not None, left_out)
+            if left_out is not None:
+                if self._left_out is None:
+                    self._left_out = np.zeros(left_out.shape, np.uint16)
+                self._left_out += left_out
 
-    def _take(self, pixels: NDArray[Any], moved: bool) -> None:
+    def _take(self, pixels: NDArray[Any], moved: bool, left_out: NDArray[np.bool_] | None) -> None:
         part = self._sampled(_SAMPLE)
         sample = pixels[part]
         light = self._response.linear(sample).astype(np.float64)
@@ -106,17 +112,23 @@ class MeshOccluder:
             self._last[...] = pixels
         self._noise.add(pixels, interpolated=moved)
         frames = self._plateaus.frames + 1
-        if frames & (frames - 1) == 0 and (noise := self._sensor()) is not None:
+        if frames & (frames - 1) == 0 and (noise := self.noise()) is not None:
             self._table = self._deviations(noise)
-        self._plateaus.add(pixels, self._table)
+        high, low = self._plateaus.high, self._plateaus.low
+        known = (high.extreme, low.extreme) if self._plateaus.frames else None
+        self._plateaus.add(without(pixels, left_out, known), self._table)
 
     def _sampled(self, step: int) -> Part:
         """Every so many rows and columns; of a mosaic, of one colour."""
         even = 2 * step if self._response.bayer else step
         return np.s_[::even, ::even]
 
-    def _sensor(self) -> Noise | None:
-        """The camera's noise, as far as the frames tell."""
+    def brightest(self) -> NDArray[Any] | None:
+        """See `Extremes`."""
+        return self._plateaus.high.extreme if self._plateaus.frames else None
+
+    def noise(self) -> Noise | None:
+        """See `Extremes`."""
         return self._noise.noise()
 
     def _deviations(self, noise: Noise) -> Plane:
@@ -129,7 +141,7 @@ class MeshOccluder:
         frames = self._plateaus.frames
         if frames < 2:
             raise NotYet(f"a mesh's circle needs 2 frames, {frames} came so far")
-        noise = self._sensor()
+        noise = self.noise()
         levels = self._levels(noise, WHOLE)
         brightest, darkest = levels.bright, levels.dark
         one = self._response.deviation(noise, self._plateaus.high.extreme)
@@ -190,11 +202,13 @@ class MeshOccluder:
         brightest, darkest = (end.extreme[part] for end in ends)
         span = brightest.astype(np.float32) - darkest
         (high, on_high, lit), (low, on_low, unlit) = (end.level(table, span, part) for end in ends)
+        missed = np.zeros(high.shape[:2]) if self._left_out is None else self._left_out[part]
+        told = (1.0 - missed / max(self._plateaus.frames, 1)).astype(np.float32)
         if not self._averaged:
             linear = self._response.linear
-            return _Levels(linear(brightest), linear(darkest), on_high, on_low, lit, unlit)
+            return _Levels(linear(brightest), linear(darkest), on_high, on_low, lit, unlit, told)
         between = self._response.linear_between
-        return _Levels(between(high), between(low), on_high, on_low, lit, unlit)
+        return _Levels(between(high), between(low), on_high, on_low, lit, unlit, told)
 
     def _pull(self, noise: Noise | None, levels: _Levels, other: Plane) -> dict[str, float]:
         """How far, at most, the bands that are averaged pull the levels together: medians of what
@@ -276,6 +290,7 @@ class MeshOccluder:
         # In full light, or umbra, a pixel stays a while; at the rim of an island it comes near.
         flat = span < np.maximum(2 * SIGNIFICANT * noisy, np.float32(0.3) * expected)
         rests_on = np.where(too_dark, _most(levels.lit), _most(levels.unlit))
+        rests_on = rests_on / np.maximum(levels.told, np.float32(1e-3))
         briefly = flat
         for side in (too_dark, ~too_dark):
             usual = rests_on[lit & ~short & side]
@@ -314,7 +329,7 @@ class MeshOccluder:
         assert self._last is not None
         rows = np.s_[::7]  # in no step with a pitch
         spacings = []
-        noise = self._sensor()
+        noise = self.noise()
         least = 1.0 if noise is None else 4 * SIGNIFICANT * noise.typical
         ends = self._plateaus.high.extreme, self._plateaus.low.extreme
         pictures = [_green(x) for x in (self._last, *ends)]
@@ -337,7 +352,7 @@ class MeshOccluder:
             self._followed = frames
             step = max(1, math.isqrt(self._last.shape[0] * self._last.shape[1] // _FOLLOWED))
             part = self._sampled(step)
-            noise = self._sensor()
+            noise = self.noise()
             levels = self._levels(noise, part)
             one = self._response.deviation(noise, self._plateaus.high.extreme[part])
             pitch = self._pitch(self._beta or 0.3) / (part[0].step or 1)
@@ -347,8 +362,8 @@ class MeshOccluder:
 
 @dataclass(frozen=True, slots=True)
 class _Levels:
-    """Linear light in full light and in the umbra (float32), the samples that each rests on, and
-    how many frames were there."""
+    """Linear light in full light and in the umbra (float32), the samples that each rests on, how
+    many frames were there, and the part of all frames that told of each pixel (H, W)."""
 
     bright: Plane
     dark: Plane
@@ -356,6 +371,7 @@ class _Levels:
     on_dark: NDArray[np.uint16]
     lit: NDArray[np.uint16]
     unlit: NDArray[np.uint16]
+    told: Plane
 
     def of(self, part: Part) -> _Levels:
         """Of a part of the picture."""

@@ -3,10 +3,11 @@
 A shadow's edges outshine the scene's texture, and a mesh's are everywhere: whatever follows edges
 follows the mesh. But the shadow is not where the scene is: against the mean of earlier frames, in
 which it is smeared out, it is noise, and its spectrum can be learned (a mesh's is a few lines).
-Weighted by the inverse of that spectrum the correlation of a frame with the mean has its peak at
-the camera's shift: the most likely one, with a variance that the spectra tell beforehand (Knapp and
-Carter's generalised correlation). Pictures are logarithms of light, so that the source's strength
-does not matter. Only shifts are looked for: a camera on a tripod hardly turns.
+Weighted by the inverse of that spectrum the correlation of a frame with the mean has its peak near
+the camera's shift (Knapp and Carter's generalised correlation). Pictures are logarithms of light
+there, so that the source's strength does not matter. The place is then known to a quarter of a
+pixel, and no further: what is left of the shadow pulls. From there `placing.Levels` finds the rest,
+and the turn.
 
 The first frames are the reference: they are aligned among themselves once they are all there.
 """
@@ -21,9 +22,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.placing import Levels, Motion, shifted
 from daemon.separation.radiometry import Plane, Response
 
-LEAST_PX = 0.3
+LEAST_PX = 0.1
 """A shift below it is none: the frame is used as it is."""
 
 MOST = 0.03
@@ -34,6 +36,9 @@ UNSURE_PX = 0.1
 
 REFERENCE = 48
 """Frames that the reference and the shadow's spectrum are learned from."""
+
+FEWEST = 16
+"""Of a recording that is shorter: so many tell something."""
 
 Warp = tuple[float, float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
@@ -46,7 +51,9 @@ _TAPER = 0.08  # part of the picture at each edge that fades out
 _SHORTEST = (1, 16, 8, 4, 2, 1, 1, 1, 1)
 """Wavelengths, in small pixels, that count in each round of aligning the first frames: all, to see
 whether they lie apart at all; then long ones first, which a shake leaves in the mean."""
-_SAMPLED = 6  # every so many of the first frames show how far halves of the waves agree
+_SETTLED = 0.15  # px: first frames that wander less from round to round lie apart as they do
+_TILE = 16  # small pixels: halves of the picture are a checkerboard of such squares
+_SAMPLED = 6  # every so many of the first frames show how far the halves agree
 
 _STEPS = 6  # of refining a peak
 _PEAK = 5.0  # deviations of the correlation by which a peak is told from chance
@@ -54,43 +61,60 @@ _SHARE = 0.35  # of the height that the reference's own peak has
 
 
 @dataclass(frozen=True, slots=True)
-class Shift:
-    """A frame's shift against the reference, in pixels; `found`: the correlation has a peak."""
+class Place:
+    """Where a frame was taken from: by how much its middle is shifted against the reference's, in
+    pixels, and turned, in radians; `px`: how far the corner that moved most has. `found`: it is
+    known, as well as `UNSURE_PX` asks."""
 
     x: float
     y: float
+    turn: float = 0.0
+    px: float = 0.0
     found: bool = True
+    middle: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def px(self) -> float:
-        """How far."""
-        return math.hypot(self.x, self.y)
-
-    @property
-    def warp(self) -> Warp:
-        """What takes the frame back to the reference."""
-        return (1.0, 0.0, -self.x, 0.0, 1.0, -self.y)
+    def warp(self) -> Warp | None:
+        """What takes the frame back to the reference; None: it lies there."""
+        if self.px <= LEAST_PX:
+            return None
+        if not self.turn:
+            return (1.0, 0.0, -self.x, 0.0, 1.0, -self.y)
+        cos, sin = math.cos(self.turn), math.sin(self.turn)
+        x, y = self.middle
+        from_x, from_y = x + self.x, y + self.y
+        return (
+            cos,
+            sin,
+            round(x - cos * from_x - sin * from_y, 4),
+            -sin,
+            cos,
+            round(y + sin * from_x - cos * from_y, 4),
+        )
 
 
 class Registration:
-    """Finds each frame's shift. Deterministic; memory: `REFERENCE` small pictures at most."""
+    """Finds each frame's place. Deterministic; memory: `REFERENCE` small pictures at most."""
 
     def __init__(self, response: Response, *, mesh: bool = False) -> None:
         """With `mesh` the shadow is a pattern that is alike everywhere, and could be followed."""
         self._response = response
         self._mesh = mesh
         self._explained = 0.0  # part of the first frames' differences that their shifts take away
-        self._first: list[Spectrum] = []
-        self._matched: Spectrum | None = None  # the reference over the shadow's spectrum
-        self._curvature = np.zeros((2, 2))
-        self._seen_sd = math.inf
+        self._first: list[Plane] = []
+        self._levels: Levels | None = None  # None: there is no reference yet
+        self._matched: Spectrum = np.zeros((0, 0), np.complex64)  # over the shadow's spectrum
+        self._coarse_sd = math.inf
         self._noise = 1.0  # deviation of the correlation by chance
         self._factor = 1
+        self._full = (0, 0)
         self._shape = (0, 0)
         self._waves: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._window: Plane | None = None
+        self.sd = math.inf
+        """The standard deviation of a shift, px; inf before a reference is there."""
         self.wandered = 0.0
-        """How far the first frames lay from one another, px."""
+        """How far the first frames lay from the middle of all, px."""
 
     def suits(self, shape: tuple[int, ...]) -> bool:
         """Whether pictures of a shape are large enough: in tiny ones a fine mesh is all texture."""
@@ -103,40 +127,57 @@ class Registration:
     @property
     def learned(self) -> bool:
         """Whether there is a reference."""
-        return self._matched is not None
-
-    @property
-    def sd(self) -> float:
-        """The standard deviation of a shift, px; inf before a reference is there."""
-        if self._matched is None or np.linalg.det(self._curvature) <= 0.0:
-            return math.inf
-        least = math.sqrt(float(np.trace(np.linalg.inv(self._curvature))))
-        return self._factor * max(least, self._seen_sd)
+        return self._levels is not None
 
     @property
     def tells(self) -> bool:
-        """Whether the scene has texture enough for shifts to be known."""
+        """Whether the scene has texture enough for places to be known."""
         followed = self._mesh and self._explained > _FOLLOWED
-        return self.sd < UNSURE_PX and not followed
+        return max(self.sd, self._coarse_sd) < UNSURE_PX and not followed
 
     def learn(self, pixels: NDArray[Any]) -> None:
         """Take in a frame for the reference; the last of `REFERENCE` ones makes it."""
-        if self._matched is not None:
+        if self._levels is not None:
             return
         if self._window is None:
             self._prepare(pixels.shape)
-        self._first.append(self._spectrum(pixels))
+        self._first.append(self._small(pixels))
         if len(self._first) == REFERENCE:
+            self.settle()
+
+    def settle(self) -> None:
+        """Make the reference of the frames there are; of fewer than `FEWEST` there is none."""
+        if self._levels is None and len(self._first) >= FEWEST:
             self._settle()
             self._first.clear()
 
-    def of(self, pixels: NDArray[Any]) -> Shift:
-        """The shift of a frame. Raises ValueError before a reference is there."""
-        if self._matched is None:
+    def of(self, pixels: NDArray[Any], strength: float = 1.0) -> Place:
+        """The place of a frame, in which the source has about that strength. Raises ValueError
+        before a reference is there."""
+        if self._levels is None:
             raise ValueError("there is no reference yet")
-        x, y, height = self._find(self._spectrum(pixels), self._matched)
+        small = self._small(pixels)
+        x, y, height = self._find(self._spectrum(small), self._matched)
         found = height > max(_PEAK, _SHARE * self._noise) * self._noise
-        return Shift(round(x * self._factor, 3), round(y * self._factor, 3), found)
+        near = shifted(x, y)
+        exact = self._levels.place(small / np.float32(strength), near) if found else None
+        if exact is None:
+            return self._place(near, False)
+        motion, variance = exact
+        return self._place(motion, self._factor * _spread(variance) < UNSURE_PX)
+
+    def _place(self, motion: Motion, found: bool) -> Place:
+        """In pixels of the frame. A turn that no pixel feels is none."""
+        assert self._levels is not None
+        moved = motion[:2] @ np.array([*self._levels.middle, 1.0]) - self._levels.middle
+        x, y = (round(float(v) * self._factor, 3) for v in moved)
+        turn = round(math.atan2(motion[1, 0], motion[0, 0]), 7)
+        height, width = self._full
+        middle = ((width - 1) / 2.0, (height - 1) / 2.0)
+        swung = abs(turn) * math.hypot(*middle)
+        if swung <= LEAST_PX:
+            turn = swung = 0.0
+        return Place(x, y, turn, math.hypot(x, y) + swung, found, middle)
 
     # ------------------------------------------------------------ pictures
 
@@ -144,20 +185,24 @@ class Registration:
         self._factor = self._reduced(shape)
         height, width = (n // self._factor // 2 * 2 for n in shape[:2])
         self._shape = (height, width)
+        self._full = (height * self._factor, width * self._factor)
         self._window = _fading(height)[:, None] * _fading(width)[None, :]
         rows, columns = np.fft.fftfreq(height), np.fft.rfftfreq(width)
         self._waves = np.asarray(2 * np.pi * rows), np.asarray(2 * np.pi * columns)
 
-    def _spectrum(self, pixels: NDArray[Any]) -> Spectrum:
-        """Of the logarithm of a frame's light, in a small grey picture."""
-        assert self._window is not None
+    def _small(self, pixels: NDArray[Any]) -> Plane:
+        """A small grey picture of a frame's light."""
         height, width = self._shape
         factor = self._factor
         small = pixels[: height * factor, : width * factor]
         if factor > 1:
             small = cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA)
         grey = small.astype(np.float32) if small.ndim == 2 else small.mean(2, dtype=np.float32)
-        grey = self._response.linear_between(grey)
+        return self._response.linear_between(grey)
+
+    def _spectrum(self, grey: Plane) -> Spectrum:
+        """Of the logarithm of a small picture."""
+        assert self._window is not None
         floor = np.float32(_FLOOR * max(float(np.quantile(grey[::4, ::4], 0.95)), 1e-3))
         log = np.log(np.maximum(grey, 0) + floor)
         spectrum = np.fft.rfft2((log - log.mean()) * self._window).astype(np.complex64)
@@ -169,52 +214,63 @@ class Registration:
     def _settle(self) -> None:
         """Align the first frames among themselves, and learn what the shadow makes of them."""
         count = len(self._first)
+        spectra = [self._spectrum(small) for small in self._first]
         shifts = np.zeros((count, 2))
         assert self._waves is not None
         wave = np.hypot(self._waves[0][:, None], self._waves[1][None, :]) / (2 * np.pi)
         for shortest in _SHORTEST:
             seen = wave * shortest <= 1.0
             before = shifts.copy()
-            moved = [self._moved(s, *d) for s, d in zip(self._first, shifts, strict=True)]
+            moved = [self._moved(s, *d) for s, d in zip(spectra, shifts, strict=True)]
             total = np.sum(moved, axis=0)
             mean = total / count
             shadow = np.mean([np.abs(s - mean) ** 2 for s in moved], axis=0) * count / (count - 1)
             shadow += 0.05 * np.median(shadow)
-            for k, spectrum in enumerate(self._first):
+            for k, spectrum in enumerate(spectra):
                 others = (total - moved[k]) / (count - 1)
                 x, y, _ = self._find(spectrum, (seen * others / shadow).astype(np.complex64))
                 shifts[k] = x, y
             shifts -= np.median(shifts, axis=0)
             change = np.abs(shifts - before).max() * self._factor
-            if shortest == 1 and change < LEAST_PX / 2:
+            if shortest == 1 and change < _SETTLED:
                 break
-        moved = [self._moved(s, *d) for s, d in zip(self._first, shifts, strict=True)]
+        self._place_first([shifted(*d) for d in shifts])
+        moved = [self._moved(s, *d) for s, d in zip(spectra, shifts, strict=True)]
         mean = np.mean(moved, axis=0)
         shadow = np.mean([np.abs(s - mean) ** 2 for s in moved], axis=0) * count / (count - 1)
         shadow += 0.05 * np.median(shadow)
         signal = np.maximum(np.abs(mean) ** 2 - shadow / count, 0.0)  # the mean has shadow, too
         self._matched = (mean / shadow).astype(np.complex64)
         self._noise = math.sqrt(_both(np.abs(mean) ** 2 / shadow))
-        self._curvature = self._information(signal / shadow)
-        unaligned = np.mean([np.abs(s - np.mean(self._first, axis=0)) ** 2 for s in self._first], 0)
+        curvature = self._information(signal / shadow)
+        if np.linalg.det(curvature) > 0.0:
+            self._coarse_sd = self._factor * math.sqrt(float(np.trace(np.linalg.inv(curvature))))
+        unaligned = np.mean([np.abs(s - np.mean(spectra, axis=0)) ** 2 for s in spectra], 0)
         self._explained = 1.0 - _both(shadow) / max(_both(unaligned), 1e-9)
         self.wandered = float(np.hypot(*shifts.T).max()) * self._factor
-        self._differ(mean, shadow)
 
-    def _differ(self, mean: NDArray[Any], shadow: NDArray[Any]) -> None:
-        """See how far two halves of the waves, every other one, agree about the first frames."""
-        rows, columns = np.indices(mean.shape)
+    def _place_first(self, motions: list[Motion]) -> None:
+        """Make the levels that all others are placed by, of the first frames, which have moved so,
+        and see how well two halves of the picture agree about these."""
+        self._levels = levels = Levels(self._first, motions)
+        rows, columns = np.indices(self._first[0].shape) // _TILE
         odd = (rows + columns) % 2 == 1
-        found = [
-            [
-                self._find(s, (part * mean / shadow).astype(np.complex64))[:2]
-                for s in self._first[::_SAMPLED]
-            ]
-            for part in (odd, ~odd)
-        ]
-        apart = np.subtract(*np.asarray(found))
-        # of both halves together the deviation is half of their difference's
-        self._seen_sd = float(np.sqrt(np.mean(np.sum(apart**2, axis=1)))) / 2.0
+        apart = []
+        for picture, motion in list(zip(self._first, motions, strict=True))[::_SAMPLED]:
+            halves = [levels.place(picture, motion, half) for half in (odd, ~odd)]
+            one, other = (None if half is None else self._off(half[0]) for half in halves)
+            if one is not None and other is not None:
+                apart.append(one - other)
+        if apart:
+            # of both halves together the deviation is half of their difference's
+            self.sd = self._factor * float(np.sqrt(np.mean(np.square(apart)) * 2.0)) / 2.0
+
+    def _off(self, motion: Motion) -> NDArray[np.float64]:
+        """By how much the middle of a small picture is shifted."""
+        assert self._levels is not None
+        middle = np.array(self._levels.middle)
+        shift: NDArray[np.float64] = motion[:2, :2] @ middle + motion[:2, 2] - middle
+        return shift
 
     def _information(self, ratio: NDArray[Any]) -> NDArray[np.float64]:
         """What spectra of such a ratio of signal to noise tell of a shift (Fisher's), px^-2."""
@@ -275,63 +331,6 @@ class Registration:
         return float(at[0]), float(at[1]), height
 
 
-def aligned(pixels: NDArray[Any], warp: tuple[float, ...], bayer: bool) -> NDArray[Any]:
-    """A frame moved by a warp to where the reference lies, same shape and dtype: bilinear, so that
-    no sample is brighter or darker than its neighbours. A mosaic's four kinds of pixels are moved
-    each by itself. What lies outside the frame repeats its edge: see `beyond`."""
-    matrix = np.asarray(warp, np.float64).reshape(2, 3)
-    if not bayer:
-        return _warped(pixels, matrix)
-    out = np.empty_like(pixels)
-    for row in (0, 1):
-        for column in (0, 1):
-            first = np.array([column, row], np.float64)
-            shift = (matrix[:, :2] @ first + matrix[:, 2] - first) / 2.0
-            part = np.ascontiguousarray(pixels[row::2, column::2])
-            out[row::2, column::2] = _warped(part, np.column_stack([matrix[:, :2], shift]))
-    return out
-
-
-def placed(
-    pixels: NDArray[Any],
-    warp: tuple[float, ...],
-    bayer: bool,
-    known: tuple[NDArray[Any], NDArray[Any]] | None,
-) -> NDArray[Any]:
-    """A frame `aligned`; what it knows nothing of becomes the middle between two frames of extremes
-    that are `known`, so that it counts as neither."""
-    found = aligned(pixels, warp, bayer)
-    if known is not None:
-        outside = beyond(pixels.shape, warp, bayer)
-        first, second = (plane[outside].astype(np.uint32) for plane in known)
-        found[outside] = (first + second) // 2
-    return found
-
-
-def beyond(shape: tuple[int, ...], warp: tuple[float, ...], bayer: bool) -> NDArray[np.bool_]:
-    """Pixels (H, W) of which a frame that was moved by a warp knows nothing."""
-    matrix = np.asarray(warp, np.float64).reshape(2, 3)
-    inverse = np.linalg.inv(matrix[:, :2])
-    y, x = np.ogrid[: shape[0], : shape[1]]
-    moved_x, moved_y = x - matrix[0, 2], y - matrix[1, 2]
-    from_x = inverse[0, 0] * moved_x + inverse[0, 1] * moved_y
-    from_y = inverse[1, 0] * moved_x + inverse[1, 1] * moved_y
-    edge = 1.0 if bayer else 0.0  # a mosaic's outermost colour may be one pixel in
-    outside = np.zeros(shape[:2], np.bool_)
-    for at, last in ((from_x, shape[1] - 1), (from_y, shape[0] - 1)):
-        outside |= (at < edge - 0.01) | (at > last - edge + 0.01)
-    return outside
-
-
-def _warped(pixels: NDArray[Any], matrix: NDArray[np.float64]) -> NDArray[Any]:
-    size = (pixels.shape[1], pixels.shape[0])
-    return np.asarray(
-        cv2.warpAffine(
-            pixels, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-    )
-
-
 def _fading(length: int) -> Plane:
     """A window that rises and falls as half a cosine at its ends."""
     edge = max(2, round(_TAPER * length))
@@ -344,3 +343,8 @@ def _fading(length: int) -> Plane:
 def _both(half: NDArray[Any]) -> float:
     """The sum over a whole spectrum of which half is given."""
     return float(2.0 * half.sum() - half[:, 0].sum() - half[:, -1].sum())
+
+
+def _spread(variance: NDArray[np.float64]) -> float:
+    """The deviation of a shift, small pixels."""
+    return math.sqrt(float(variance[0, 0] + variance[1, 1]))

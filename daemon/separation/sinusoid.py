@@ -20,13 +20,15 @@ from daemon.separation.blur import of_wave
 from daemon.separation.coordinates import other_axis
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
-from daemon.separation.handedness import STRONG, strength
+from daemon.separation.handedness import STRONG, Wave, strength
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import mirrored
-from daemon.separation.ripple import ripple
+from daemon.separation.ripple import Ripple, ripple
 from daemon.separation.scan_noise import ResidualNoise, Told
 from daemon.separation.steadiness import compare
+from daemon.separation.straddling import Split, as_neighbours, between_phases, edges
+from daemon.separation.weave import Woven
 
 _LEAST_ECCENTRIC = 0.02
 """Least ratio of the fit's eigenvalues: phases that nearly coincide don't tell M, B, φ apart."""
@@ -42,8 +44,10 @@ _MISFIT = 5.0
 _DOUBTFUL = 2.0
 """Above this it is none where it is also a part of the wave: ..."""
 _DISTORTED = 0.05
-_RIPPLED = 0.03  # of the wave: with more of it in mean or amplitude, light was no sinusoid
+_BENT = 0.03  # of the wave: with more of it in its amplitude thrice a period, light was no sinusoid
+_ODD = 0.05  # with more of it in mean or amplitude once a period, frames are not of these phases
 _MANY = 0.2  # of the pixels
+_BLURRED = 0.03  # of direct light
 
 
 class LeastSquares:
@@ -52,7 +56,7 @@ class LeastSquares:
     `phases[i]` is pattern i's (frequency, δ in radians). Planes: `direct_std`, `global_std` (as the
     components), `phase` (H, W) in 0..2π of the first frequency, and `column` or `row` (H, W) in
     projector pixels where `periods` say how to get it. `blur_px`: the optics' as calibrated, for
-    where the frames do not tell it.
+    where the frames do not tell it. `patches`: phases are even within patches, and jump between.
     """
 
     def __init__(
@@ -66,6 +70,7 @@ class LeastSquares:
         weave: float = 0.0,
         axis: str = "x",
         blur_px: float | None = None,
+        patches: bool = False,
     ) -> None:
         self._response = response
         self._phases = tuple(phases)
@@ -75,6 +80,7 @@ class LeastSquares:
         self._weave = weave
         self._axis = axis
         self._known_blur = blur_px
+        self._patches = patches
         self._references = References(response)
         self._fits = [_Fit() for _ in range(1 + max(f for f, _ in phases))]
         self._noise = ResidualNoise(response)
@@ -108,12 +114,24 @@ class LeastSquares:
         noise = self._noise.told()
         blur, blur_from = self._blur(ready)
         solved = [
-            self._separate(fit, noise, gain)
-            for fit, gain in zip(ready, self._gains(blur), strict=False)
+            self._separate(fit, noise, self._gain(fit, index, blur))
+            for index, fit in enumerate(ready)
         ]
         direct, indirect, direct_var, global_var = _combine(solved)
         brightest = np.maximum.reduce([fit.brightest() for fit in ready])
         quality = np.zeros(direct.shape[:2], dtype=np.uint16)
+        between: dict[str, Any] = {}
+        if self._patches:
+            split = self._between_patches(ready[0], noise, direct, indirect, np.sqrt(direct_var))
+            total: Plane = direct + indirect
+            direct, indirect = split.direct, total - split.direct
+            total_std = np.sqrt(np.maximum(global_var - direct_var, np.float32(0.0)))
+            direct_std, global_std = split.stated(
+                np.sqrt(direct_var), np.sqrt(global_var), total, total_std
+            )
+            direct_var, global_var = np.square(direct_std), np.square(global_std)
+            quality |= bits(split.known, Quality.EDGE)
+            between["edges"] = round(float(np.mean(split.known)), 4)
         if len(solved) > 1:
             quality |= bits(_disagree(solved), Quality.DISAGREE)
         reflected, told = self._mirrored(ready[0], noise)
@@ -148,10 +166,12 @@ class LeastSquares:
             ),
             **told,
             **steady,
+            **between,
             "misfit": None if misfit is None else round(misfit, 3),
-            "ripple": None if rippled is None else round(rippled, 4),
+            "ripple": [[round(one.tone, 4), round(one.frames, 4)] for one in rippled],
             "advice": [
                 *_advice(misfit, self._noise.distortion, disagreeing, rippled),
+                *self._unknown(blur),
                 *other_axis({n: planes[n] for n in ("column", "row") if n in planes}),
                 *advice,
                 *noise.advice(),
@@ -183,15 +203,22 @@ class LeastSquares:
 
     def _blur(self, ready: list[_Fit]) -> tuple[float | None, str]:
         """The blur of projector and camera together, in projector pixels, and how it is known: from
-        several periods, else as calibrated, else (None) it is not.
+        several periods, else as calibrated, else from the weave of one, else (None) it is not.
 
         Blur of standard deviation s takes exp(-2π²s²f²) from a wave of frequency f, so the ratio of
         two waves' amplitudes tells s. The median over the scene is taken: scattering within the
-        scene, which is global light, differs from place to place and stays in the amplitudes.
+        scene, which is global light, differs from place to place and stays in the amplitudes. A
+        weave has many frequencies in one wave; of plain stripes blur and global light look alike.
         """
-        if len(ready) < 2 or len(ready) != len(self._periods):
-            return self._known_blur, "" if self._known_blur is None else "calibration"
-        squares = np.asarray([-log(of_wave(1.0, p, self._weave)) for p in self._periods])
+        if len(ready) != len(self._periods) or not self._periods:
+            return None, ""
+        if len(ready) == 1:
+            if self._known_blur is not None:
+                return self._known_blur, "calibration"
+            woven = self._woven(ready[0], 0)
+            found = None if woven is None else woven.blur(ready[0].grey()[0])
+            return found, "" if found is None else "weave"
+        squares = np.asarray([-4.0 * log(of_wave(0.5, p, self._weave)) for p in self._periods])
         logs = []
         first = None
         for fit in ready:
@@ -204,13 +231,43 @@ class LeastSquares:
         slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
         return float(np.sqrt(max(-slope, 0.0))), "scan"
 
-    def _gains(self, blur: float | None) -> list[float]:
-        """What gives each wave its amplitude back."""
-        if not self._periods:
-            return [1.0] * len(self._fits)
-        return [1.0 / of_wave(blur or 0.0, period, self._weave) for period in self._periods]
+    def _unknown(self, blur: float | None) -> list[str]:
+        """A line where blur may matter and is not known."""
+        if blur is not None or not self._periods:
+            return []
+        taken = 1.0 - min(of_wave(1.0, period, self._weave) for period in self._periods)
+        if taken < _BLURRED:
+            return []
+        return [
+            "the blur of projector and camera is not known, for one period of plain stripes does "
+            f"not tell it: 1 px of it makes direct light {taken:.0%} too small, which counts as "
+            "global; take the pattern with its weave (--weave 1) or a second period "
+            "(--periods 16,24), or run `umbra calibrate leak`"
+            if self._weave == 0.0
+            else "the blur of projector and camera is not known, for too little of the picture "
+            f"tells it, or with too much noise: 1 px of it makes direct light {taken:.0%} too "
+            "small, which counts as global; run `umbra calibrate leak`, or take a second period "
+            "(--periods 16,24)"
+        ]
 
-    def _separate(self, fit: _Fit, noise: Told, gain: float) -> tuple[Plane, Plane, Plane, Plane]:
+    def _woven(self, fit: _Fit, index: int) -> Woven | None:
+        if self._weave == 0.0:
+            return None
+        return Woven.of(fit.grey()[1], period=self._periods[index], weave=self._weave)
+
+    def _gain(self, fit: _Fit, index: int, blur: float | None) -> float | Plane:
+        """What gives a wave its amplitude back, of the shape of a frame or one for all."""
+        if not blur or not self._periods:
+            return 1.0
+        woven = self._woven(fit, index)
+        if woven is None:
+            return 1.0 / of_wave(blur, self._periods[index], self._weave)
+        gain = woven.gain(blur)
+        return gain if fit.solve()[0].ndim == 2 else gain[..., None]
+
+    def _separate(
+        self, fit: _Fit, noise: Told, gain: float | Plane
+    ) -> tuple[Plane, Plane, Plane, Plane]:
         """Direct, global and their variances from one frequency."""
         mean, cosine, sine = fit.solve()
         b = self._leakage
@@ -221,39 +278,52 @@ class LeastSquares:
             # |B| of noise alone is not 0: to first order its square is too large by one variance.
             power = np.maximum(power - np.float32(wave_var) * of_wave * of_wave, 0)
         amplitude: Plane = np.sqrt(power)
-        direct: Plane = amplitude * np.float32(2.0 * gain / (1.0 - b))
+        of_amplitude = np.asarray(gain, np.float32) * np.float32(2.0 / (1.0 - b))
+        direct: Plane = amplitude * of_amplitude
         total = self._references.total(mean, b)
         indirect: Plane = total.light - direct
-        direct_var: Plane = np.square(of_wave) * np.float32(
-            wave_var * (2.0 * gain / (1.0 - b)) ** 2
-        )
+        direct_var: Plane = np.square(of_wave * of_amplitude) * np.float32(wave_var)
         total_var = total.of_references(noise.deviation)
         total_var += np.square(of_mean) * np.asarray(mean_var * total.of_half, dtype=np.float32)
         return direct, indirect, direct_var, direct_var + total_var
 
+    def _between_patches(
+        self, fit: _Fit, noise: Told, direct: Plane, indirect: Plane, deviation: Plane
+    ) -> Split:
+        """Random phases: what the edges of patches have too little of, see `straddling`."""
+        mean, wave = fit.grey()
+        light: Plane = np.maximum(mean, np.float32(1e-3))
+        contrast: Plane = np.asarray(np.abs(wave) / light, dtype=np.float32)
+        between = between_phases(wave)
+        mosaic = bool(self._response.bayer)
+        edge = edges(contrast, self._grey_noise(fit, noise) / light, between, mosaic=mosaic)
+        return as_neighbours(direct, direct + indirect, deviation, edge, mosaic=mosaic)
+
+    def _grey_noise(self, fit: _Fit, noise: Told) -> Plane:
+        """Of the wave's amplitude (H, W), colours added."""
+        one = self._level(fit, noise) * np.float32(fit.variances()[1] ** 0.5)
+        return one if one.ndim == 2 else np.asarray(np.sqrt(np.square(one).sum(axis=2)), np.float32)
+
     def _mirrored(self, fit: _Fit, noise: Told) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
         """Where the phase runs against the picture's, or changes faster: see `residue`."""
-        _, cosine, sine = fit.solve()
-        wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
-        if wave.ndim == 3:
-            wave = np.asarray(wave.sum(axis=2), dtype=np.complex64)
+        _, wave = fit.grey()
         deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
         even = bool(self._periods)
         return mirrored([wave], strength([wave], deviation), turning=even, smooth=even)
 
-    def _ripple(self, ready: list[_Fit], noise: Told) -> float | None:
-        """How much of the wave shows in its own mean and amplitude: see `ripple`."""
+    def _ripple(self, ready: list[_Fit], noise: Told) -> list[Ripple]:
+        """How much of the wave shows in its own mean and amplitude, where three phases leave no
+        residuals to say so."""
         found = []
         for fit in ready:
-            mean, cosine, sine = fit.solve()
-            wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
-            if wave.ndim == 3:
-                mean = np.asarray(mean.sum(axis=2), dtype=np.float32)
-                wave = np.asarray(wave.sum(axis=2), dtype=np.complex64)
+            if fit.frames > 3:
+                continue
+            mean, wave = fit.grey()
             deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
-            found.append(ripple(mean, wave, strength([wave], deviation) > np.float32(STRONG)))
-        known = [one for one in found if one is not None]
-        return max(known) if known else None
+            known = ripple(mean, wave, strength([wave], deviation) > np.float32(STRONG))
+            if known is not None:
+                found.append(known)
+        return found
 
     def _level(self, fit: _Fit, noise: Told) -> Plane:
         mean, _, _ = fit.solve()
@@ -310,6 +380,14 @@ class _Fit:
         found = np.tensordot(inverse, self._sums, axes=1)
         return found[0], found[1], found[2]
 
+    def grey(self) -> tuple[Plane, Wave]:
+        """M and the wave as a complex number (H, W), colours added."""
+        mean, cosine, sine = self.solve()
+        wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
+        if wave.ndim == 3:
+            return mean.sum(axis=2), np.asarray(wave.sum(axis=2), dtype=np.complex64)
+        return mean, wave
+
     def variances(self) -> tuple[float, float]:
         """Variance of M and of one factor of the wave for samples of variance 1."""
         inverse = np.linalg.inv(self._normal)
@@ -348,7 +426,7 @@ def _disagree(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> NDArray[np.boo
 
 
 def _advice(
-    misfit: float | None, distortion: float | None, disagreeing: float, rippled: float | None
+    misfit: float | None, distortion: float | None, disagreeing: float, rippled: list[Ripple]
 ) -> list[str]:
     """What to do about frames that are no sinusoids in time; [] where they are."""
     lines = []
@@ -360,12 +438,16 @@ def _advice(
             "they are not the phases that were declared (--phases, --periods), the tone curve is "
             "not linear, or something moved"
         )
-    elif rippled is not None and rippled > _RIPPLED:
+    if (bent := max((one.tone for one in rippled), default=0.0)) > _BENT:
         lines.append(
-            f"the pattern itself shows in the components, by {rippled:.0%} of the wave: the "
+            f"the wave's amplitude goes up and down three times a period, by {bent:.0%}: the "
             "projector's or the camera's tone curve is not linear (run `umbra calibrate tone`, or "
-            "give the camera's curve with --tone), or the frames are not the phases that were "
-            "declared (--phases)"
+            "give the camera's curve with --tone)"
+        )
+    elif (odd := max((one.frames for one in rippled), default=0.0)) > _ODD:
+        lines.append(
+            f"the pattern itself shows in the components, by {odd:.0%} of the wave: the frames are "
+            "not thirds of a turn apart (--phases), or not of one exposure"
         )
     if disagreeing > _MANY:
         lines.append(

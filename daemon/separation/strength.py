@@ -56,6 +56,11 @@ class SourceStrength:
         before, it is that of the first frame, and wanders."""
         return self._one is not None
 
+    @property
+    def latest(self) -> float:
+        """The source's strength in the last frame that was asked about."""
+        return self._strength
+
     def of(self, pixels: NDArray[Any]) -> float:
         """The source's strength in the next frame."""
         last, self._now = self._now, self._sample(pixels)

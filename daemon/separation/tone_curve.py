@@ -16,6 +16,7 @@ from daemon.separation.estimator import (
     Plot,
 )
 from daemon.separation.radiometry import FrameMean, Plane, Response
+from daemon.separation.references import References
 from daemon.separation.sampling import Mask, Turns, bright, ratio
 
 _LEVELS = 255
@@ -30,43 +31,35 @@ class ToneCurve:
     """
 
     def __init__(self, response: Response, levels: tuple[float, ...]) -> None:
-        self._response = response
         self._levels = levels
-        self._white, self._black = FrameMean(response), FrameMean(response)
+        self._references = References(response)
         self._mean = FrameMean(response)
         self._turns = Turns()
-        self._saturated: Mask | None = None
         self._planes: tuple[Plane, Plane, Mask] | None = None
         self._found: dict[int, tuple[float, float]] = {}
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Estimator`."""
-        if observation.lighting is Lighting.WHITE:
+        if observation.lighting is not Lighting.PATTERN:
             if observation.used:
-                self._white.add(pixels)
-                saturated = pixels >= self._response.saturated_from
-                self._saturated = (
-                    saturated if self._saturated is None else self._saturated | saturated
-                )
-        elif observation.lighting is Lighting.BLACK:
-            if observation.used:
-                self._black.add(pixels)
-        else:
-            if (overdue := self._turns.overdue(observation)) is not None:
-                self._close(overdue)
-            if observation.used:
-                self._mean.add(pixels)
-            if observation.last:
-                self._close(observation.pattern)
+                self._references.add(pixels, observation.lighting)
+            return
+        if (overdue := self._turns.overdue(observation)) is not None:
+            self._close(overdue)
+        if observation.used:
+            self._mean.add(pixels)
+        if observation.last:
+            self._close(observation.pattern)
 
     def _close(self, pattern: int) -> None:
         if not self._mean.frames:
             return
         if self._planes is None:
-            if self._saturated is None:
+            black, white = (self._references.mean(k) for k in (Lighting.BLACK, Lighting.WHITE))
+            saturated = self._references.white_saturated
+            if black is None or white is None or saturated is None:
                 raise ValueError("levels are measured against black and white, which come first")
-            black, white = self._black.value(), self._white.value()
-            self._planes = black, white - black, bright(black, white, self._saturated)
+            self._planes = black, white - black, bright(black, white, saturated)
         black, whole, good = self._planes
         self._found[pattern] = ratio(self._mean.value() - black, whole, good)
         self._mean.clear()

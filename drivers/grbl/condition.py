@@ -10,14 +10,8 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from drivers.base import (
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    StageState,
-    StageStatus,
-)
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.stage import StageState, StageStatus
 from drivers.clock import NS, Clock
 from drivers.grbl import faults
 from drivers.grbl.link import REPLY_S, GrblLink

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.base import DeviceRefused
+from drivers.base.errors import DeviceRefused
 from drivers.grbl import protocol as grbl
 from drivers.grbl.faults import Firmware
 from drivers.grbl.link import REPLY_S, GrblLink

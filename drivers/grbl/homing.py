@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.base import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceRefused, DeviceTimeout
 from drivers.grbl import faults
 from drivers.grbl import protocol as grbl
 from drivers.grbl.condition import Condition, no_machine_position
@@ -40,7 +40,7 @@ class Homing:
         self._halted_by_reset = False
         self._under_way = True
         try:
-            link.command("$H", timeout_s, "home")
+            link.command("$H", timeout_s, "home", watched=True)
             if link.alarm is not None:
                 link.settle_alarm("home")
         except DeviceTimeout:
@@ -52,6 +52,10 @@ class Homing:
                 f"homing did not end within {timeout_s:g} s, and was stopped",
                 "check that both axes turn; raise the time, or $25 (seek rate)",
             ) from None
+        except DeviceGarbled:
+            self._under_way = False
+            link.reset("home")  # the count of its answers is wrong
+            raise
         except DeviceError:
             if link.interrupted and not self._halted_by_reset:
                 link.urge(grbl.RESET)  # the halt came before the `$H`: it has only held
@@ -80,11 +84,16 @@ class Homing:
         condition.settle("home")
 
     def unlock(self) -> None:
-        """Leave an alarm; the position stays unknown. Safe to send again."""
+        """Leave an alarm; the position stays unknown. Without one nothing is done, so that a
+        motion goes on. Safe to send again."""
+        condition, link = self._condition, self._condition.link
+        link.await_banner("unlock")
+        if link.alarm is None and condition.ask("unlock").state != "Alarm":
+            return
         self._clear_for("unlock")
-        self._condition.link.command("$X", REPLY_S, "unlock")
-        self._condition.link.alarm = None
-        self._condition.lost()
+        link.command("$X", REPLY_S, "unlock")
+        link.alarm = None
+        condition.lost()
 
     def _clear_for(self, phase: str) -> None:
         """Bring it to where `$H` and `$X` are heard: nothing queued, no critical alarm."""

@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers.base import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.clock import NS, Clock
 from drivers.grbl import faults
 from drivers.grbl import protocol as grbl
@@ -36,6 +36,8 @@ STILL_SILENT_S = 0.6  # asked again after a silence: a safe state is not to wait
 REPLY_S = 2.0  # $$ takes .2 s at 115200 baud
 BANNER_S = 1.5  # from a soft reset, the .5 s after an alarm included
 LOST_ACK_S = 1.0  # idle for this long with lines unacknowledged
+WATCH_S = 0.5  # between questions whether a long command has begun
+IDLE_LOOKS = 3  # it has not: Idle so often
 STRANGE_KEPT = 20
 
 
@@ -80,6 +82,7 @@ class GrblLink:
         self._idle_since_ns: int | None = None
         self._quiet_reports = 0
         self._silent = False  # a query was not answered, and nothing came since
+        self._owed = False  # an answer that nobody waits for any more
 
     # ------------------------------------------------------------ opening
 
@@ -123,7 +126,7 @@ class GrblLink:
         self.refused = None
         self._first_ask_ns = None
         self._idle_since_ns, self._quiet_reports = None, 0
-        self._silent = False
+        self._silent = self._owed = False
 
     def reset(self, phase: str) -> None:
         """Soft reset: everything in flight is gone. Returns after the banner. DeviceTimeout."""
@@ -179,29 +182,42 @@ class GrblLink:
     def _send(self, sent: _Sent) -> None:
         self._flight.append(sent)
         self._traffic_ns, self._idle_since_ns = self._now(), None
+        self._quiet_reports = 0
         self._write(sent.text.encode("ascii") + b"\n")
 
-    def command(self, text: str, timeout_s: float, phase: str) -> list[str]:
+    def command(
+        self, text: str, timeout_s: float, phase: str, *, watched: bool = False
+    ) -> list[str]:
         """Send a line and wait for its ok; gives what came before it.
 
-        Raises DeviceRefused (the error by its name), DeviceTimeout, DeviceLost. Also returns when
-        an alarm or a reset came in the ok's place: the caller looks at `alarm` and `was_reset`.
+        Raises DeviceRefused (the error by its name), DeviceTimeout, DeviceLost; when `watched`,
+        DeviceGarbled for a line that set nothing going. Also returns when an alarm or a reset
+        came in the ok's place: the caller looks at `alarm` and `was_reset`.
         """
         sent = _Sent(text, len(text) + 1, streamed=False)
         self._send(sent)
         alarms = self.alarm
-        done = self.wait(
-            lambda: bool(sent.answer) or sent not in self._flight or self.alarm != alarms,
-            timeout_s,
-            phase,
-        )
-        if not done:
-            raise DeviceTimeout(
-                self.port.device,
-                phase,
-                f"no answer to {text} within {timeout_s:g} s",
-                "check the cable; the stage has to be connected and homed again",
-            )
+
+        def ended() -> bool:
+            return bool(sent.answer) or sent not in self._flight or self.alarm != alarms
+
+        deadline = self._after(timeout_s)
+        while not self.wait(ended, min(WATCH_S, timeout_s) if watched else timeout_s, phase):
+            if self._now() >= deadline:
+                raise DeviceTimeout(
+                    self.port.device,
+                    phase,
+                    f"no answer to {text} within {timeout_s:g} s",
+                    "check the cable; the stage has to be connected and homed again",
+                )
+            if self._quiet_reports >= IDLE_LOOKS:
+                raise DeviceGarbled(
+                    self.port.device,
+                    phase,
+                    f"it stands idle: {text} or its answer was lost on the line",
+                    "check cable and interference, then again",
+                )
+            self.realtime(grbl.STATUS)
         if sent.answer.startswith("error:"):
             problem, remedy = faults.refusal(int(sent.answer[6:]), self.firmware)
             raise DeviceRefused(self.port.device, phase, problem, remedy)
@@ -241,6 +257,7 @@ class GrblLink:
 
     def begin(self, phase: str) -> None:
         """At the start of each of the owner's calls: take what has come. Raises DeviceLost."""
+        self._owed = self._interrupted.is_set() and self._first_ask_ns is not None
         self._interrupted.clear()
         if not self.port.is_open or self._reader is None:
             raise DeviceLost(self.port.device, phase, "it is not connected", "reconnect it")
@@ -250,6 +267,9 @@ class GrblLink:
 
     def ask(self, phase: str) -> grbl.Report:
         """A fresh report. Asks again when one was dropped; DeviceTimeout, DeviceLost."""
+        if self._owed:  # what an interrupted call asked for is older than what interrupted it
+            self._owed, before = False, self._now()
+            self.wait(lambda: self._fresh(before), REPEAT_S, phase)
         began = self._now()
         allowed_s = STILL_SILENT_S if self._silent else QUERY_S
         deadline = began + round(allowed_s * NS)

@@ -12,7 +12,8 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from drivers.base import DeviceRefused, StageInfo
+from drivers.base.errors import DeviceRefused
+from drivers.base.stage import StageInfo
 from drivers.grbl.link import GrblLink
 from drivers.track import Arc, Point
 

@@ -25,7 +25,6 @@ STATUS = b"?"
 HOLD = b"!"
 RESUME = b"~"
 RESET = b"\x18"
-JOG_CANCEL = b"\x85"
 
 MM_PER_INCH = 25.4
 

@@ -7,25 +7,31 @@ from __future__ import annotations
 
 import math
 
-from drivers.base import DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceRefused, DeviceTimeout
 from drivers.clock import NS
 from drivers.grbl import protocol as grbl
 from drivers.grbl.condition import Condition, stands
 
 KEPT_MM = 0.002  # a position is reported to .001 mm: this near is the same
 SETTLE_S = 1.0  # a hold, beyond the time of its deceleration
+AGAIN_S = 0.25  # a hold that shows no effect for so long may have been lost on the line
 
 
 def stand(condition: Condition, phase: str, deceleration_s: float) -> grbl.Report:
     """Decelerate to a stand; the report that proves it. A jog ends in Idle, others in Hold.
 
+    A hold cancels a jog as well. Grbl's own jog cancel (0x85) is not sent: one that comes while the
+    jog ends leaves Grbl 1.1 idle, and deaf to every line until it is resumed or reset. A second
+    hold at that moment is harmless, for it shows as Hold.
+
     Raises DeviceTimeout after the deceleration's time and `SETTLE_S` more.
     """
     link, clock = condition.link, condition.clock
     sent = condition.travelling or link.in_flight > 0
+    again_ns = began_ns = clock.now_ns()
     if sent:
         link.realtime(grbl.HOLD)
-    deadline_ns = clock.now_ns() + round((SETTLE_S + deceleration_s) * NS)
+        again_ns += round(AGAIN_S * NS)
     idle = 0
     while True:
         report = condition.ask(phase)
@@ -35,13 +41,14 @@ def stand(condition: Condition, phase: str, deceleration_s: float) -> grbl.Repor
         idle += report.state == "Idle"
         if report.state == "Idle" and (not sent or idle > 1):
             return report
-        if clock.now_ns() > deadline_ns:
+        now_ns = clock.now_ns()
+        if now_ns - began_ns > (SETTLE_S + deceleration_s) * NS:
             raise DeviceTimeout(
                 condition.device, phase, "it does not come to a stand", "switch its power off"
             )
-        if report.state in {"Run", "Jog"}:
-            link.realtime(grbl.JOG_CANCEL if report.state == "Jog" else grbl.HOLD)
-            sent = True
+        if report.state in {"Run", "Jog"} and now_ns >= again_ns:
+            link.realtime(grbl.HOLD)
+            sent, again_ns = True, now_ns + round(AGAIN_S * NS)
 
 
 def resume(condition: Condition, phase: str) -> None:

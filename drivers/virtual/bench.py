@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drivers.base import Context
+from drivers.base.device import Context
 from drivers.virtual.geometry import F32, Pinhole
 from drivers.virtual.occluder import Occluder
 from drivers.virtual.transport import transport

@@ -5,73 +5,19 @@ from __future__ import annotations
 import threading
 from collections import deque
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
-from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import cv2
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    Context,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    Identity,
-    Options,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceRefused, DeviceTimeout
 from drivers.clock import NS
-from drivers.virtual.device import VirtualDevice, VirtualOptions
+from drivers.virtual.cameraoptions import EXPOSURE_US, GAIN_DB, CameraOptions
+from drivers.virtual.device import VirtualDevice
 from drivers.virtual.faults import Fault
-from drivers.virtual.geometry import F32
-from drivers.virtual.sky import Sway
-from drivers.virtual.timeline import Forgotten
-from drivers.virtual.transport import mosaic, pick, room
-from drivers.virtual.view import view
-
-CORRECT_US = 1e6 / 60  # with this exposure and no gain ...
-CORRECT_LEVEL = 0.8  # ... radiance 1 gives this part of the scale
-EXPOSURE_US = (20.0, 10e6)
-GAIN_DB = (0.0, 36.0)
-ROLLING_BANDS = 16  # rows of a rolling shutter are exposed in so many groups
-LUMINANCE = np.asarray((0.30, 0.59, 0.11), np.float32)  # a mono sensor's response
-
-
-class CameraOptions(VirtualOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Keys of ``[camera] driver = "virtual"``."""
-
-    width: Annotated[int, Meta(ge=32, le=8192)] = 640
-    height: Annotated[int, Meta(ge=32, le=8192)] = 480
-    pixel_format: PixelFormat = PixelFormat.BAYER_RG12
-    exposure_us: Annotated[float, Meta(ge=EXPOSURE_US[0], le=EXPOSURE_US[1])] = CORRECT_US
-    gain: Annotated[float, Meta(ge=GAIN_DB[0], le=GAIN_DB[1])] = 0.0  # dB
-    frame_rate_hz: Annotated[float, Meta(gt=0)] = 30.0  # free-running
-    trigger_latency_us: Annotated[float, Meta(ge=0)] = 50.0
-    readout_ms: Annotated[float, Meta(ge=0)] = 4.0
-    rolling_ms: Annotated[float, Meta(ge=0)] = 0.0  # a rolling shutter: from first row to last
-    rolling_told: bool = True  # whether it says so
-    triggers: tuple[Literal["software", "hardware", "none"], ...] = (
-        "software",
-        "hardware",
-        "none",
-    )  # what it takes; "none": it can run free
-    buffers: Annotated[int, Meta(ge=1, le=256)] = 8  # frames that wait in the driver
-    black_level: Annotated[float, Meta(ge=0)] | None = None  # counts; None: 1/64 of full scale
-    full_well_e: Annotated[float, Meta(gt=0)] = 10_500.0  # electrons at full scale without gain
-    read_noise_e: Annotated[float, Meta(ge=0)] = 3.0
-    noise: bool = True  # shot and read noise; rounding stays
-    ambient: Annotated[float, Meta(ge=0)] = 0.02  # radiance of white under the room's light
-    shake_px: Annotated[float, Meta(ge=0)] = 0.0  # sd of the picture's place, frame by frame
-    gusts: tuple[tuple[float, Annotated[float, Meta(ge=0)]], ...] = ()  # (second, sd in px)
-    sway_hz: Annotated[float, Meta(gt=0)] = 1.5  # how fast a gust makes the camera sway
-    seed: Annotated[int, Meta(ge=0)] = 1
+from drivers.virtual.sensor import Sensor, Settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +34,8 @@ class VirtualCamera(VirtualDevice, Camera):
     Software-triggered: an exposure begins `trigger_latency_us` after its trigger, or when the
     sensor is free. Hardware-triggered: the same after each pulse on the bench's line, but a pulse
     that finds the sensor exposing is not heard. Free-running: at `frame_rate_hz`. A frame that
-    finds none of the `buffers` free is lost, and its sequence number with it. Pixels are black
-    level + electrons x gain, with shot noise (its variance the electrons themselves) and read noise
-    from a generator seeded with `seed` and the number of the frame since the camera was made. A
-    frame whose light the bench has forgotten is `incomplete`. Gain in dB.
+    finds none of the `buffers` free is lost, and its sequence number with it. A frame whose light
+    the bench has forgotten is `incomplete`. Gain in dB. `Sensor` makes counts of the light.
 
     `configure`, `start`, `stop`, `safe` and `check` are safe to send again; `trigger` is not.
     """
@@ -103,7 +47,7 @@ class VirtualCamera(VirtualDevice, Camera):
         super().__init__(name, options, context)
         assert isinstance(options, CameraOptions)
         self._o = options
-        self._set = CameraSettings(
+        self._set = Settings(
             exposure_us=options.exposure_us,
             gain=options.gain,
             pixel_format=options.pixel_format,
@@ -117,62 +61,33 @@ class VirtualCamera(VirtualDevice, Camera):
         self._free = 0  # when the sensor can begin to expose
         self._started = 0
         self._next = 0  # sequence number
-        self._frames = 0  # since the camera was made: seeds the noise
         self._last: tuple[NDArray[Any], Frame] | None = None
-        self._epoch = self.clock.now_ns()
-        self._sway = Sway(options.gusts, options.sway_hz, options.seed)
+        self._sensor = Sensor(options, self.bench, self.clock.now_ns())
 
     # ------------------------------------------------------------ settings
 
     @property
-    def _exposure_us(self) -> float:
-        assert self._set.exposure_us is not None
-        return self._set.exposure_us
-
-    @property
-    def _gain(self) -> float:
-        assert self._set.gain is not None
-        return self._set.gain
-
-    @property
-    def _format(self) -> PixelFormat:
-        assert self._set.pixel_format is not None
-        return self._set.pixel_format
-
-    @property
-    def _roi(self) -> tuple[int, int, int, int]:
-        assert self._set.roi is not None
-        return self._set.roi
-
-    @property
-    def _black(self) -> float:
-        level = self._o.black_level
-        return self._format.full_scale // 64 if level is None else level
-
-    @property
     def _period_ns(self) -> int:
         """Between two frames: the sensor reads out a frame while it exposes the next."""
-        fastest = max(self._exposure_us * 1e3, self._o.readout_ms * 1e6)
-        if self._acquisition is Acquisition.FREE and self._set.frame_rate_hz:
+        fastest = max(self._set.exposure_us * 1e3, self._o.readout_ms * 1e6)
+        if self._acquisition is Acquisition.FREE:
             return round(max(fastest, NS / self._set.frame_rate_hz))
         return round(fastest)
 
     def connect(self) -> Identity:
         """See Device. The scene is built here, where no frame's deadline waits for it."""
         identity = super().connect()
-        self.bench.prepare(self._o.width, self._o.height)
-        for layout in self._layouts():
-            _room(self._o.width, self._o.height, layout)
+        self._sensor.prepare(self._set.layouts)
         return identity
 
     def info(self) -> CameraInfo:
         """See Camera."""
-        fastest = max(self._exposure_us * 1e3, self._o.readout_ms * 1e6)
+        fastest = max(self._set.exposure_us * 1e3, self._o.readout_ms * 1e6)
         return CameraInfo(
-            self._roi[2],
-            self._roi[3],
-            self._format,
-            black_level=self._black,
+            self._set.roi[2],
+            self._set.roi[3],
+            self._set.pixel_format,
+            black_level=self._sensor.black(self._set),
             exposure_range_us=EXPOSURE_US,
             gain_range=GAIN_DB,
             gain_unit="dB",
@@ -195,7 +110,7 @@ class VirtualCamera(VirtualDevice, Camera):
 
     def settings(self) -> CameraSettings:
         """See Camera."""
-        return self._set
+        return CameraSettings(**asdict(self._set))
 
     def configure(self, wanted: CameraSettings) -> CameraSettings:
         """See Camera."""
@@ -209,12 +124,10 @@ class VirtualCamera(VirtualDevice, Camera):
             (new.gain, GAIN_DB, "gain in dB"),
             (new.frame_rate_hz, (0.01, 1e4), "frame rate in Hz"),
         ):
-            if value is None or not low <= value <= high:
+            if not low <= value <= high:
                 raise self._refuse(
                     "configure", f"{what} {value:g}", f"choose one from {low:g} to {high:g}"
                 )
-        assert new.roi is not None
-        assert new.pixel_format is not None
         x, y, width, height = new.roi
         fits = x >= 0 and y >= 0 and x + width <= self._o.width and y + height <= self._o.height
         if not (fits and width > 0 and height > 0):
@@ -224,7 +137,7 @@ class VirtualCamera(VirtualDevice, Camera):
         if new.pixel_format.bayer and (x % 2 or y % 2):
             raise self._refuse("configure", f"roi {new.roi}", "a mosaic begins at even x and y")
         self._set = new
-        return new
+        return self.settings()
 
     def _refuse(self, phase: str, problem: str, remedy: str) -> DeviceRefused:
         return DeviceRefused(self.name, phase, problem, remedy)
@@ -261,7 +174,7 @@ class VirtualCamera(VirtualDevice, Camera):
         kinds = self._begin("trigger")
         start = self.clock.now_ns() + round(self._o.trigger_latency_us * 1e3)
         start = max(start, self._free)
-        end = start + round(self._exposure_us * 1e3)
+        end = start + round(self._set.exposure_us * 1e3)
         if Fault.DROP_TRIGGER not in kinds:
             self._free = max(end, start + self._period_ns)
             self._queue(start, end)
@@ -299,6 +212,7 @@ class VirtualCamera(VirtualDevice, Camera):
                 self._heard = pulse
                 start = pulse + round(self._o.trigger_latency_us * 1e3)
                 kinds = self.faults.strike("trigger", self._halted)
+                kinds |= self.faults.strike("pulse", self._halted)
                 missed = Fault.DROP_TRIGGER in kinds
                 if missed or start < self._free:
                     continue
@@ -309,12 +223,12 @@ class VirtualCamera(VirtualDevice, Camera):
 
     def _expose_at(self, start: int) -> None:
         self._free = start + self._period_ns
-        self._queue(start, start + round(self._exposure_us * 1e3))
+        self._queue(start, start + round(self._set.exposure_us * 1e3))
 
     def _run(self) -> None:
         """Expose all that a free-running camera has exposed by now, and the one in the making;
         the next one, if there is no other to wait for."""
-        period, exposure = self._period_ns, round(self._exposure_us * 1e3)
+        period, exposure = self._period_ns, round(self._set.exposure_us * 1e3)
         due = (self.clock.now_ns() - self._started) // period
         while not self._waiting or (self._next <= due and len(self._waiting) < self._o.buffers):
             start = self._started + self._next * period
@@ -325,7 +239,7 @@ class VirtualCamera(VirtualDevice, Camera):
         """See Camera."""
         if self._acquisition is None:
             raise self._refuse("grab", "it is not acquiring", "start it first")
-        shape, dtype = self.info().shape, self._format.dtype
+        shape, dtype = self.info().shape, self._set.pixel_format.dtype
         if out.shape != shape or out.dtype != dtype:
             raise self._refuse(
                 "grab", f"a buffer of {out.shape} {out.dtype}", f"give {shape} {dtype}"
@@ -348,7 +262,7 @@ class VirtualCamera(VirtualDevice, Camera):
         if halted or there > deadline:
             raise self._late(halted, timeout_s, "allow for the exposure and the readout")
         self._waiting.popleft()
-        complete = self._expose(exposure, out)
+        complete = self._sensor.expose(exposure.start_ns, exposure.end_ns, self._set, out)
         if Fault.TORN_FRAME in kinds and self._last is not None:
             out[: shape[0] // 2] = self._last[0][: shape[0] // 2]
         if Fault.INCOMPLETE_FRAME in kinds:
@@ -361,8 +275,8 @@ class VirtualCamera(VirtualDevice, Camera):
             exposure.start_ns,
             exposure.end_ns,
             utc,
-            self._exposure_us,
-            self._gain,
+            self._set.exposure_us,
+            self._set.gain,
             incomplete=not complete,
         )
         self._last = (out.copy(), frame)
@@ -395,110 +309,6 @@ class VirtualCamera(VirtualDevice, Camera):
             with self.bench.lock:
                 self.bench.line.listeners.discard(self._wake)
 
-    # ------------------------------------------------------------ light to counts
-
-    @property
-    def _size(self) -> tuple[int, int]:
-        return self._o.width, self._o.height
-
-    def _counts(self) -> float:
-        """Counts above black for radiance 1."""
-        scale = self._format.full_scale - self._black
-        exposed = self._exposure_us / CORRECT_US * 10 ** (self._gain / 20)
-        return CORRECT_LEVEL * exposed * scale
-
-    def _layouts(self) -> tuple[str, ...]:
-        return (self._format.bayer,) if self._format.bayer else ("R", "G", "B")
-
-    def _sensor(self, planes: list[F32]) -> F32:
-        """Planes of `_layouts` as the pixels of this format, within the ROI."""
-        if self._format.bayer:
-            picture = planes[0]
-        else:
-            picture = np.stack(planes, -1)
-            if self._format.channels == 1:
-                picture = np.asarray(picture @ LUMINANCE, np.float32)
-        x, y, width, height = self._roi
-        return picture[y : y + height, x : x + width]
-
-    def _radiance(self, start_ns: int, end_ns: int, layouts: tuple[str, ...]) -> list[F32]:
-        """The bench's, each band of rows at its own time where the shutter rolls."""
-        rolling = round(self._o.rolling_ms * 1e6)
-        if not rolling:
-            return self.bench.radiance(start_ns, end_ns, self._size, layouts)
-        edges = np.linspace(0, self._o.height, ROLLING_BANDS + 1).astype(int)
-        bands = []
-        for k, (top, below) in enumerate(pairwise(edges)):
-            later = round(rolling * k / (ROLLING_BANDS - 1))
-            planes = self.bench.radiance(start_ns + later, end_ns + later, self._size, layouts)
-            bands.append([plane[top:below] for plane in planes])
-        return [np.concatenate(of_layout) for of_layout in zip(*bands, strict=True)]
-
-    def _light(self, start_ns: int, end_ns: int, rng: np.random.Generator) -> list[F32]:
-        """Mean radiance, one plane a layout. Raises Forgotten."""
-        dx, dy = rng.normal(0, self._o.shake_px, 2) if self._o.shake_px else (0.0, 0.0)
-        if self._o.gusts:
-            sway = self._sway.at(((start_ns + end_ns) / 2 - self._epoch) / NS)
-            dx, dy = dx + sway[0], dy + sway[1]
-        still = not (dx or dy)
-        layouts = self._layouts() if still else ("R", "G", "B")
-        planes = self._radiance(start_ns, end_ns, layouts)
-        if self._o.ambient:
-            for k, layout in enumerate(layouts):
-                planes[k] += np.float32(self._o.ambient) * _room(*self._size, layout)
-        if still:
-            return planes
-        shift = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
-        moved = [
-            np.asarray(
-                cv2.warpAffine(p, shift, self._size, borderMode=cv2.BORDER_REPLICATE), np.float32
-            )
-            for p in planes
-        ]
-        if not self._format.bayer:
-            return moved
-        return [pick(np.stack(moved, -1), mosaic(self._format.bayer, moved[0].shape))]
-
-    def _expose(self, exposure: _Exposure, out: NDArray[Any]) -> bool:
-        """Fill `out` with the counts of an exposure that is over; False: its light is forgotten."""
-        rng = np.random.Generator(np.random.SFC64([self._o.seed, self._frames]))
-        self._frames += 1
-        try:
-            planes = self._light(exposure.start_ns, exposure.end_ns, rng)
-        except Forgotten:
-            out[...] = 0
-            return False
-        counts = self._sensor(planes) * np.float32(self._counts())
-        if self._o.noise:
-            amplified = 10 ** (self._gain / 20)
-            per_electron = (self._format.full_scale - self._black) / self._o.full_well_e * amplified
-            variance = counts * np.float32(per_electron)
-            variance += np.float32((self._o.read_noise_e * per_electron) ** 2)
-            noise = rng.standard_normal(counts.shape, np.float32)
-            noise *= np.sqrt(variance, out=variance)
-            counts += noise
-        counts += np.float32(self._black + 0.5)
-        np.clip(counts, 0, self._format.full_scale + 0.5, out=counts)
-        out[...] = counts  # truncated: the half above makes it rounding
-        return True
-
     def truth(self, sources: tuple[str, ...] = ()) -> dict[str, NDArray[np.float32]]:
         """See Camera."""
-        names = self.bench.shaded(sources) or self.bench.main_sources()
-        if not names:
-            return {}
-        direct, others = self.bench.components(names, self._size, ("R", "G", "B"))
-        mosaicked = bool(self._format.bayer)
-        parts = {}
-        for name, planes in (("direct", direct), ("global", others)):
-            picture = np.stack(planes, -1)
-            if self._format.channels == 1 and not mosaicked:
-                picture = np.asarray(picture @ LUMINANCE, np.float32)
-            x, y, width, height = self._roi
-            parts[name] = picture[y : y + height, x : x + width] * np.float32(self._counts())
-        return parts
-
-
-@lru_cache(maxsize=8)
-def _room(width: int, height: int, layout: str) -> F32:
-    return room(view(width, height), layout)
+        return self._sensor.truth(sources, self._set)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from typing import ClassVar
 
-from drivers.base import Context, Device, DeviceLost, Identity, Options
+from drivers.base.device import Context, Device, Identity, Options
+from drivers.base.errors import DeviceLost
 from drivers.virtual.bench import Bench
 from drivers.virtual.faults import Fault, Faults
 

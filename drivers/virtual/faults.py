@@ -2,7 +2,8 @@
 
 A fault is written ``kind@n`` or ``kind:act@n``: it strikes at the n-th call (counted from 1) of an
 act, by default the device's main one (a camera's `grab`, a projector's `show`, a stage's `status`,
-a light's `set`). ``vanish@12*3`` stays away for three attempts to connect.
+a light's `set`). A camera's `trigger` is any trigger, its `pulse` one that comes by wire.
+``vanish@12*3`` stays away for three attempts to connect.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterable
 
-from drivers.base import DeviceGarbled, DeviceLost, DeviceTimeout
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceTimeout
 from drivers.clock import Clock
 
 PATTERN = re.compile(r"(?P<kind>[a-z-]+)(:(?P<act>[a-z_]+))?@(?P<call>[1-9]\d*)(\*(?P<times>\d+))?")

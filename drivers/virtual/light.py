@@ -12,7 +12,9 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
-from drivers.base import Context, DeviceRefused, Light, Options
+from drivers.base.device import Context, Options
+from drivers.base.errors import DeviceRefused
+from drivers.base.light import Light
 from drivers.clock import NS
 from drivers.virtual.bench import Carrier, Emission
 from drivers.virtual.device import VirtualDevice, VirtualOptions

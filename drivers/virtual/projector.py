@@ -14,15 +14,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Context,
-    DeviceRefused,
-    LoadedSequence,
-    Options,
-    Projector,
-    ProjectorInfo,
-    SequenceLimits,
-)
+from drivers.base.device import Context, Options
+from drivers.base.errors import DeviceRefused
+from drivers.base.projector import LoadedSequence, Projector, ProjectorInfo, SequenceLimits
 from drivers.clock import NS
 from drivers.virtual.bench import Emission, TriggerLine
 from drivers.virtual.device import VirtualDevice, VirtualOptions

@@ -8,17 +8,9 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from drivers.base import (
-    Context,
-    DeviceRefused,
-    DeviceTimeout,
-    Identity,
-    Options,
-    Stage,
-    StageInfo,
-    StageState,
-    StageStatus,
-)
+from drivers.base.device import Context, Identity, Options
+from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.stage import Stage, StageInfo, StageState, StageStatus
 from drivers.clock import NS
 from drivers.virtual.device import VirtualDevice, VirtualOptions
 from drivers.virtual.faults import Fault

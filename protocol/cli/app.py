@@ -18,6 +18,10 @@ from protocol.errors import UmbraError
 SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     "Without a rig": {
         "demo": ("demo:demo", "Separate a simulated scene: a first look, no hardware needed."),
+        "patterns": (
+            "patterns:patterns",
+            "Write a scan's patterns as images, to project them by other means.",
+        ),
         "separate": ("separate:separate", "Separate photographs or a video that you already have."),
     },
     "Scans": {
@@ -129,7 +133,7 @@ def _version(asked: bool) -> None:
     if asked:
         from importlib.metadata import version
 
-        from protocol.messages import PROTOCOL
+        from protocol.messages.envelopes import PROTOCOL
 
         typer.echo(f"umbra {version('umbra-rig')} (protocol {PROTOCOL})")
         raise typer.Exit

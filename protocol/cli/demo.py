@@ -18,7 +18,7 @@ from protocol.cli.runs import fetch, wanted
 from protocol.cli.watch import follow, must_be_done
 from protocol.cli.words import Fetched, frames
 from protocol.errors import Code, UmbraError
-from protocol.scans import AnySeparation
+from protocol.scans.anyscan import AnySeparation
 
 if TYPE_CHECKING:
     from protocol.run import Run

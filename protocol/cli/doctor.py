@@ -13,7 +13,8 @@ from protocol.cli.exits import Exit, exit_of
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.output import coloured, on_terminal, print_json
 from protocol.errors import Code, UmbraError
-from protocol.messages import Check, Examined, Outcome
+from protocol.messages.findings import Check, Outcome
+from protocol.messages.replies import Examined
 
 
 def doctor(

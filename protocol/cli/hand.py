@@ -15,7 +15,8 @@ from protocol.cli.options import build, options_of, with_options
 from protocol.cli.output import print_facts, print_json, say
 from protocol.cli.preview import png_name, say_facts
 from protocol.errors import Code, UmbraError
-from protocol.messages import Camera, CameraSettings, Done, Picture
+from protocol.messages.replies import Camera, Done, Picture
+from protocol.messages.rig import CameraSettings
 
 if TYPE_CHECKING:
     from protocol.client import Client

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from msgspec import Struct
 
 from protocol.cli.link import Json
 from protocol.cli.output import print_json, print_table, say
-from protocol.messages import Fact, Role
+from protocol.messages.access import Role
 
 SERVER_FOLDER = Path("/etc/umbra/keys")
 
@@ -24,7 +25,7 @@ Folder = Annotated[
 ]
 
 
-class Allowed(Fact, frozen=True, kw_only=True):
+class Allowed(Struct, frozen=True, kw_only=True):
     """A key that may come in."""
 
     name: str

@@ -9,7 +9,7 @@ from typing import Any
 from protocol.cli.family import member, members
 from protocol.cli.options import Option, build, options_of
 from protocol.errors import Code, UmbraError
-from protocol.scans import AnyScan, AnySeparation
+from protocol.scans.anyscan import AnyScan, AnySeparation
 
 METHODS = members(AnySeparation)
 

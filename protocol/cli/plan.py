@@ -11,7 +11,7 @@ import typer
 from protocol.cli.link import Json
 from protocol.cli.output import print_facts, print_json
 from protocol.errors import Code, UmbraError
-from protocol.scans import SUN_DEG, Grid
+from protocol.scans.occluded import SUN_DEG, Grid
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
 

@@ -19,7 +19,9 @@ from protocol.cli.delivery import write_file
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.output import on_terminal, print_json, say
 from protocol.errors import Code, UmbraError
-from protocol.messages import Picture, PreviewTaken, RigState
+from protocol.messages.events import PreviewTaken
+from protocol.messages.replies import Picture
+from protocol.messages.rig import RigState
 
 if TYPE_CHECKING:
     import numpy as np
@@ -234,7 +236,7 @@ class _Pictures:
                 yield _seen(body, notice.arrays)
 
     def _renew(self) -> None:
-        from protocol.scans import SingleImage
+        from protocol.scans.projected import SingleImage
 
         try:
             self._client.live(self._rate_hz, LEASE_S, SingleImage() if self._separating else None)

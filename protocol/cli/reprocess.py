@@ -15,7 +15,7 @@ from protocol.cli.options import options_of, with_options
 from protocol.cli.runs import Force
 from protocol.cli.scan import Wait, WaitOut, see_through
 from protocol.reading import EXPOSED, READ
-from protocol.scans import Advise
+from protocol.scans.measuring import Advise
 
 _OPTIONS = [
     *union_options(METHODS, without=EXPOSED),

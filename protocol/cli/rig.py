@@ -24,17 +24,11 @@ from protocol.cli.watch import count
 from protocol.cli.words import frames, method
 from protocol.errors import Code, UmbraError
 from protocol.following import SILENCE_S
-from protocol.messages import (
-    DeviceInfo,
-    Devices,
-    Discovered,
-    Done,
-    Log,
-    Logged,
-    RunState,
-    Search,
-    Status,
-)
+from protocol.messages.events import Logged
+from protocol.messages.findings import Search
+from protocol.messages.replies import Devices, Discovered, Done, Log, Status
+from protocol.messages.rig import DeviceInfo
+from protocol.messages.runs import RunState
 
 if TYPE_CHECKING:
     from protocol.client import Client

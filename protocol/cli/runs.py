@@ -12,7 +12,8 @@ from protocol.cli.link import Json, Keys, Rig, RunId, connect
 from protocol.cli.output import print_facts, print_json, print_table, say, size, when
 from protocol.cli.words import HEADINGS, Fetched, ending, frames, method, rows, settings
 from protocol.errors import Code, UmbraError
-from protocol.messages import Run, RunInfo, Runs, RunState
+from protocol.messages.replies import Run, Runs
+from protocol.messages.runs import RunInfo, RunState
 
 if TYPE_CHECKING:
     from protocol.client import Client

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from protocol import messages as m
 from protocol.cli.delivery import Delivery
 from protocol.cli.family import Family, command_for
 from protocol.cli.link import Json, Keys, Rig, connect
@@ -22,7 +21,9 @@ from protocol.cli.runs import Force, fetch, wanted
 from protocol.cli.watch import conclude, follow, goes_on, tell
 from protocol.cli.words import Fetched
 from protocol.errors import Code, UmbraError
-from protocol.scans import Advise, AnyCalibration, AnyScan, AnySeparation, AnyVerification
+from protocol.messages import replies
+from protocol.scans.anyscan import AnyCalibration, AnyScan, AnySeparation, AnyVerification
+from protocol.scans.measuring import Advise
 
 if TYPE_CHECKING:
     from protocol.client import Client
@@ -62,7 +63,7 @@ def see_through(
     """Follow a run that was asked for, if that is wished, and fetch what it made."""
     if delivery is None and not wait:
         if as_json:
-            print_json(m.Run(run=run.info))
+            print_json(replies.Run(run=run.info))
         else:
             print(run.id)
             if sys.stdout.isatty():
@@ -78,7 +79,9 @@ def see_through(
     )
     if as_json:
         print_json(
-            Fetched(run=run.info, files=tuple(map(str, files))) if files else m.Run(run=run.info)
+            Fetched(run=run.info, files=tuple(map(str, files)))
+            if files
+            else replies.Run(run=run.info)
         )
     elif files:
         for file in files:

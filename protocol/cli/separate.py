@@ -21,8 +21,11 @@ from protocol.cli.runs import Force, fetch, wanted
 from protocol.cli.watch import follow, must_be_done, tell
 from protocol.cli.words import Fetched, frames
 from protocol.errors import Code, UmbraError
-from protocol.messages import Health, RunInfo
-from protocol.scans import AnySeparation, PatternScan, Reference
+from protocol.messages.rig import Health
+from protocol.messages.runs import RunInfo
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import PatternScan
+from protocol.scans.spec import Reference
 
 if TYPE_CHECKING:
     from protocol.client import Client
@@ -33,9 +36,18 @@ LIVE = {
     *("auto_exposure", "deadline_s", "light_min", "light_max", "steady", "look_s"),
 }
 """Fields that are no options here: the photographs have them, or the files given say them."""
-TYPED = {"path": "DIR", "match": "--match", "bayer": "--bayer"}
+TYPED = {"path": "DIR", "match": "--match", "bayer": "--bayer", "bits": "--depth"}
 """What is typed for the keys of the recording's driver."""
 OPTIONS = union_options(METHODS, without=LIVE)
+
+
+class Depth(enum.StrEnum):
+    """Significant bits of a sample."""
+
+    TEN = "10"
+    TWELVE = "12"
+    FOURTEEN = "14"
+    SIXTEEN = "16"
 
 
 class Bayer(enum.StrEnum):
@@ -71,6 +83,13 @@ def _separate(
     ] = None,
     bayer: Annotated[
         Bayer | None, typer.Option(help="The images are a raw colour mosaic that begins so.")
+    ] = None,
+    depth: Annotated[
+        Depth | None,
+        typer.Option(
+            metavar="<10|12|14|16>",
+            help="Bits of a sample, where files of 16 hold fewer: 12 for counts up to 4095.",
+        ),
     ] = None,
     match: Annotated[
         str, typer.Option(metavar="GLOB", help="Which of the folder's names are frames.")
@@ -111,6 +130,7 @@ def _separate(
             "first": [str(file) for file in ahead],
             "match": match,
             "bayer": bayer.value if bayer else None,
+            "bits": int(depth.value) if depth else None,
         },
         # the photographs are the originals: no second copy of them
         "storage": {"keep_frames": False, "reserve_mb": 0},

@@ -9,7 +9,7 @@ import typer
 from protocol.cli.family import Family
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.output import print_json
-from protocol.messages import Done
+from protocol.messages.replies import Done
 from protocol.patterns import BLACK, WHITE, AnyPattern
 
 Lease = Annotated[

@@ -11,7 +11,8 @@ import typer
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.output import print_facts, print_json
 from protocol.errors import Code, UmbraError
-from protocol.messages import StageState, StageStatus
+from protocol.messages.replies import StageStatus
+from protocol.messages.rig import StageState
 
 if TYPE_CHECKING:
     from protocol.client import Client

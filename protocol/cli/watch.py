@@ -12,7 +12,7 @@ from protocol.cli.link import Json, Keys, Rig, RunId, connect
 from protocol.cli.output import on_terminal, print_json, say, seconds
 from protocol.cli.words import ending, frames
 from protocol.errors import Code, UmbraError
-from protocol.messages import Progress, RunInfo, RunState
+from protocol.messages.runs import Progress, RunInfo, RunState
 
 if TYPE_CHECKING:
     from protocol.run import Run

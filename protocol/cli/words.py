@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import msgspec
+from msgspec import Struct
 
 from protocol.cli.output import when
-from protocol.messages import Fact, RunInfo, RunState
+from protocol.messages.runs import RunInfo, RunState
 
 
 def method(run: RunInfo) -> str:
@@ -73,7 +74,7 @@ def _remark(run: RunInfo) -> str:
 HEADINGS = ["run", "method", "state", "frames", "submitted", "note"]
 
 
-class Fetched(Fact, frozen=True, kw_only=True):
+class Fetched(Struct, frozen=True, kw_only=True):
     """What `--json` prints when files were written: the run, and the files."""
 
     run: RunInfo

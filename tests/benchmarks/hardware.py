@@ -23,10 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from drivers import registry
-from drivers.base import Acquisition, Camera, CameraSettings, Context
-from protocol.scans import CalibrateTone, Stick
+from drivers.base.camera import Acquisition, Camera, CameraSettings
+from drivers.base.device import Context
+from protocol.scans.calibrations import CalibrateTone
+from protocol.scans.occluded import Stick
 from tests.benchmarks.bench import Running, daemon
 from tests.benchmarks.ratio import Ratio, Skipped
 from tests.drivers.xserver import screen_tools_missing, xvfb

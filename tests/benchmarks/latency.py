@@ -11,7 +11,7 @@ import time
 
 import zmq
 
-from protocol.messages import PROTOCOL
+from protocol.messages.envelopes import PROTOCOL
 from tests.benchmarks.bench import daemon
 from tests.benchmarks.pace import DEVICES, scan
 from tests.benchmarks.ratio import Ratio, percentile

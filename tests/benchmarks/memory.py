@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 from tests.benchmarks.bench import daemon
 from tests.benchmarks.pace import DEVICES
 from tests.benchmarks.ratio import Ratio

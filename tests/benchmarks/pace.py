@@ -23,10 +23,12 @@ from typing import Literal
 
 import numpy as np
 
-from daemon.frames import FrameRecord, FrameStore
+from daemon.storage.frames import FrameRecord, FrameStore
 from drivers import registry
-from drivers.base import Acquisition, Camera, CameraSettings, Context, Projector
-from protocol.scans import Checkerboard
+from drivers.base.camera import Acquisition, Camera, CameraSettings
+from drivers.base.device import Context
+from drivers.base.projector import Projector
+from protocol.scans.projected import Checkerboard
 from tests.benchmarks.bench import Running, daemon
 from tests.benchmarks.ratio import Ratio
 

@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 
 from daemon.config import parse
-from daemon.rig import Rig
-from drivers.base import Acquisition
-from protocol.scans import Checkerboard
+from daemon.devices.rig import Rig
+from drivers.base.camera import Acquisition
+from protocol.scans.projected import Checkerboard
 from tests.benchmarks.bench import daemon
 from tests.benchmarks.pace import CAMERA, DEVICES
 from tests.benchmarks.ratio import Ratio, percentile

@@ -4,7 +4,6 @@ that jumps. A scan takes as long as its frames take to be rendered, and gives th
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -14,32 +13,14 @@ from numpy.typing import NDArray
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Circle, Method, Motion, Taken, Watch
 from daemon.separation.estimator import Components, Observation
-from drivers.base import Acquisition, Context
-from drivers.clock import NS, Clock
+from drivers.base.camera import Acquisition
+from drivers.base.device import Context
+from drivers.clock import NS
 from drivers.registry import build
 from drivers.virtual.camera import VirtualCamera
 from drivers.virtual.stage import VirtualStage
-from protocol.scans import Mesh, Stick
-
-
-class Jumping(Clock):
-    """Time that passes only while somebody waits: exact, for one thread."""
-
-    def __init__(self) -> None:
-        self.now = NS
-
-    def now_ns(self) -> int:
-        return self.now
-
-    def utc_ns(self) -> int:
-        return self.now + 1_700_000_000 * NS
-
-    def wait_until(self, deadline_ns: int, wake: threading.Event | None = None) -> bool:
-        if wake is not None and wake.is_set():
-            return True
-        self.now = max(self.now, deadline_ns)
-        return False
-
+from protocol.scans.occluded import Mesh, Stick
+from tests.jumping import Jumping
 
 STAGE = {"before_scene_mm": 150.0, "hole_mm": 12.5, "pitch_mm": 20.0, "homing_feed_mm_s": 200.0}
 SUN = {"kind": "sun", "position_mm": (-300.0, 620.0, -250.0)}

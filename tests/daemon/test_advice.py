@@ -14,10 +14,13 @@ from daemon import patterns
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Taken
 from daemon.separation.estimator import Measurement, NotYet
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.cli.methods import METHODS
 from protocol.cli.options import build, options_of
-from protocol.scans import Advise, AnyScan
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.measuring import Advise
 
 PROJECTOR = ProjectorInfo(width=192, height=144, refresh_hz=60)
 BLACK = 64.0

@@ -9,10 +9,12 @@ from pathlib import Path
 import pytest
 import structlog.testing
 
-from daemon import aftermath, config
-from daemon.store import RunFolder, Store
-from protocol.messages import End, RunState
-from protocol.scans import TwoImage
+from daemon import config
+from daemon.runs import aftermath
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import Store
+from protocol.messages.runs import End, RunState
+from protocol.scans.projected import TwoImage
 
 RIG = """
 camera = {{driver = "virtual"}}

@@ -9,16 +9,16 @@ import pytest
 
 from daemon.scans.method import Bench
 from daemon.separation.noise import Noise
-from protocol.scans import (
-    AnySeparation,
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Radiometry,
     RandomBinary,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import FULL, Scene
 
 LIGHT = Radiometry(leakage=0.02)

@@ -9,19 +9,20 @@ from typing import Any
 
 import pytest
 
-from daemon import measured
-from daemon.calibration import Calibrations
+from daemon.products import measured
+from daemon.runs.calibration import Calibrations
 from daemon.separation.estimator import Measurement
-from daemon.store import RunFolder, Store
-from protocol.messages import RunState
-from protocol.scans import (
-    AnyScan,
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import Store
+from protocol.messages.runs import RunState
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.calibrations import (
     CalibrateDark,
     CalibrateLatency,
     CalibrateLeak,
     CalibrateTone,
-    Checkerboard,
 )
+from protocol.scans.projected import Checkerboard
 
 RIG: dict[str, Any] = {
     "camera": {"driver": "virtual", "model": "C", "serial": "1"},

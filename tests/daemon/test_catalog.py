@@ -6,8 +6,10 @@ import pytest
 
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Unsuitable
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
-from protocol.scans import TwoImage
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
+from protocol.scans.projected import TwoImage
 
 BENCH = Bench(
     CameraInfo(64, 48, PixelFormat.MONO12, exposure_range_us=(20.0, 1e6)),

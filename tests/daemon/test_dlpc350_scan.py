@@ -16,23 +16,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon import rig as rig_module
 from daemon.config import RigConfig, parse
-from daemon.course import Course
+from daemon.devices import rig as rig_module
+from daemon.devices.rig import Rig
 from daemon.patterns import render
-from daemon.rig import Rig
-from daemon.store import Store
-from daemon.viewfinder import Viewfinder
+from daemon.pictures.viewfinder import Viewfinder
+from daemon.runs.course import Course
+from daemon.storage.store import Store
 from drivers import dmd
-from drivers.base import Context
+from drivers.base.device import Context
 from drivers.clock import Clock
 from drivers.virtual.bench import Bench, Emission, TriggerLine
 from drivers.virtual.geometry import Pinhole
 from drivers.virtual.scene import TARGET
 from drivers.virtual.timeline import Timeline
 from protocol.errors import Code
-from protocol.messages import End, RunState
-from protocol.scans import Checkerboard, Sinusoid
+from protocol.messages.runs import End, RunState
+from protocol.scans.projected import Checkerboard, Sinusoid
 from tests.drivers.dlpc350_peer import Board, Usb
 
 SCAN = Checkerboard(checker=80, shift=30, shifts=5)
@@ -173,7 +173,9 @@ def _patterns() -> list[Any]:
     from daemon.scans.catalog import method_for
     from daemon.scans.method import Bench as Facts
     from daemon.separation.estimator import Lighting
-    from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+    from drivers.base.camera import CameraInfo
+    from drivers.base.pixelformat import PixelFormat
+    from drivers.base.projector import ProjectorInfo
 
     camera = CameraInfo(160, 120, PixelFormat.BAYER_RG12)
     projector = ProjectorInfo(2 * dmd.COLUMNS, dmd.ROWS, 60.0)

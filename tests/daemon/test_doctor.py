@@ -28,7 +28,9 @@ from daemon.doctor import (
 from daemon.doctor.exposing import Shot
 from drivers.clock import NS, RealClock, ScaledClock
 from protocol import keys as curve
-from protocol.messages import Check, DeviceInfo, Health, Outcome, Role
+from protocol.messages.access import Role
+from protocol.messages.findings import Check, Outcome
+from protocol.messages.rig import DeviceInfo, Health
 
 OK, WARNING, FAILED, SKIPPED = Outcome
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from daemon.separation.estimator import Components, Quality
 from daemon.separation.handedness import WaveSums, reversed_pattern, shift_weights
-from protocol.scans import Checkerboard, Radiometry, Sinusoid
+from protocol.scans.projected import Checkerboard, Sinusoid
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import Scene
 from tests.daemon.virtual_scene import VirtualScene
 

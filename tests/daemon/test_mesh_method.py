@@ -11,10 +11,13 @@ import pytest
 from daemon.scans.catalog import method_for
 from daemon.scans.mesh import MeshMethod
 from daemon.scans.method import Bench, Circle, Sweep, Taken, Unsuitable, Watch
-from drivers.base import CameraInfo, PixelFormat, StageInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.stage import StageInfo
 from protocol import mesh as geometry
 from protocol.patterns import Axis
-from protocol.scans import Mesh, Radiometry, Reference, Stick
+from protocol.scans.occluded import Mesh, Stick
+from protocol.scans.spec import Radiometry, Reference
 
 STAGE = StageInfo(((0.0, 100.0), (0.0, 60.0)), 50.0)
 CAMERA = CameraInfo(64, 48, PixelFormat.MONO12)

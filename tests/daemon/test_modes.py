@@ -9,8 +9,11 @@ import pytest
 from daemon.config import SequencerSection
 from daemon.exposing.modes import GUARDS, Mode, choose, pace, whole_periods
 from daemon.scans.method import Bench, Unsuitable
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo, SequenceLimits
-from protocol.scans import Checkerboard, Mesh
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo, SequenceLimits
+from protocol.scans.occluded import Mesh
+from protocol.scans.projected import Checkerboard
 
 EXPOSURE_US = 5000.0
 LIMITS = SequenceLimits(images=128, bits=1, period_us=(235.0, 1e6))

@@ -12,8 +12,11 @@ from daemon import patterns
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Taken
 from daemon.separation.estimator import Components
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
-from protocol.scans import AnyScan, Checkerboard, RandomBinary, TwoImage
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import Checkerboard, RandomBinary, TwoImage
 
 HEIGHT, WIDTH = 48, 64
 BENCH = Bench(

@@ -5,12 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon import report
-from daemon.frames import FrameRecord
+from daemon.products.report import separation as report
 from daemon.separation.estimator import Observation
-from daemon.store import RunFile
-from protocol.messages import Product, RunState
-from protocol.scans import AnyScan, Checkerboard, Mesh, Stick, TwoImage
+from daemon.storage.frames import FrameRecord
+from daemon.storage.runfolder import RunFile
+from protocol.messages.runs import Product, RunState
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import Mesh, Stick
+from protocol.scans.projected import Checkerboard, TwoImage
 
 EVIL = """<script>alert("1")</script>'"&$id${note}"""
 

@@ -15,29 +15,30 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon import aftermath, config, products
-from daemon.frames import FrameRecord, FrameStore
-from daemon.reprocessing import Reprocessing, method_of
-from daemon.reprocessor import Reprocessor
+from daemon import config
+from daemon.products import separated
+from daemon.runs import aftermath
+from daemon.runs.reprocessing import Reprocessing, method_of
+from daemon.runs.reprocessor import Reprocessor
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, Observation
-from daemon.store import RunFolder, Store
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo, StageInfo
+from daemon.storage.frames import FrameRecord, FrameStore
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import Store
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
+from drivers.base.stage import StageInfo
 from protocol.errors import Code, UmbraError
-from protocol.messages import AnyEvent, Product, Progressed, Reprocess, RunState
-from protocol.scans import (
-    AnyScan,
-    CalibrateLeak,
-    Checkerboard,
-    GrayCode,
-    Mesh,
-    Radiometry,
-    SingleImage,
-    Sinusoid,
-    Stick,
-    TwoImage,
-)
+from protocol.messages.commands import Reprocess
+from protocol.messages.events import AnyEvent, Progressed
+from protocol.messages.runs import Product, RunState
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.calibrations import CalibrateLeak
+from protocol.scans.occluded import Mesh, Stick
+from protocol.scans.projected import Checkerboard, GrayCode, SingleImage, Sinusoid, TwoImage
+from protocol.scans.spec import Radiometry
 
 Frames = Iterable[NDArray[Any] | None]
 
@@ -122,7 +123,7 @@ def parent_of(
     kept.close()
     result = estimator.result()
     assert isinstance(result, Components)
-    made = products.write(
+    made = separated.write(
         run,
         method.conclude(result),
         full_scale=camera.pixel_format.full_scale,

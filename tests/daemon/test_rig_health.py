@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from daemon import config
-from daemon.rig import Rig
-from drivers.base import DeviceLost
-from protocol.messages import DeviceInfo, Health
+from daemon.devices.rig import Rig
+from drivers.base.errors import DeviceLost
+from protocol.messages.rig import DeviceInfo, Health
 
 
 def test_a_check_that_is_older_than_the_loss_says_nothing() -> None:

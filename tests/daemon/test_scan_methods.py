@@ -10,9 +10,14 @@ import pytest
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Method, Taken, Unsuitable, Watch
 from daemon.separation.estimator import Lighting
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.patterns import BLACK, WHITE, Checker
-from protocol.scans import AnyScan, Checkerboard, Radiometry, Reference, Stick, TwoImage
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import Stick
+from protocol.scans.projected import Checkerboard, TwoImage
+from protocol.scans.spec import Radiometry, Reference
 
 PROJECTOR = ProjectorInfo(width=64, height=48, refresh_hz=60)
 

@@ -12,23 +12,14 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from daemon.server import Answer, Caller, Server
-from drivers.base import DeviceLost
+from daemon.serving.server import Answer, Caller, Server
+from drivers.base.errors import DeviceLost
 from protocol import wire
 from protocol.errors import Code, UmbraError
-from protocol.messages import (
-    PROTOCOL,
-    Abort,
-    AnyCommand,
-    Dark,
-    Done,
-    GetQueue,
-    Hello,
-    Picture,
-    Request,
-    Role,
-    Snap,
-)
+from protocol.messages.access import Role
+from protocol.messages.commands import Abort, AnyCommand, Dark, GetQueue, Hello, Snap
+from protocol.messages.envelopes import PROTOCOL, Request
+from protocol.messages.replies import Done, Picture
 
 
 class Desk:

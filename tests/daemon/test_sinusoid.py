@@ -14,7 +14,7 @@ from daemon.separation.estimator import Components, Lighting, NotYet, Observatio
 from daemon.separation.frameset import UNCHECKED
 from daemon.separation.radiometry import Response
 from daemon.separation.sinusoid import LeastSquares
-from protocol.scans import Sinusoid as Spec
+from protocol.scans.projected import Sinusoid as Spec
 from tests.daemon.scene import Scene
 
 FULL = 65535
@@ -201,7 +201,7 @@ def test_a_resumed_fit_gives_the_same_bits() -> None:
 
 def test_two_periods_give_back_what_blur_takes() -> None:
     scene = Scene(blur=0.8, sigma=0.003)
-    one = scene.scan(Spec(phases=5, references=()))
+    one = scene.scan(Spec(phases=5, weave=0.0, references=()))
     two = scene.scan(Spec(phases=5, periods=(12.0, 20.0), references=()))
     inside = np.s_[8:-8, 8:-8]
     loss = float(np.median(one.direct[inside] / scene.direct[inside]))

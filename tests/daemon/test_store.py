@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.durable import Damaged
-from daemon.frames import FrameRecord, FrameStore
 from daemon.separation.estimator import Observation
-from daemon.store import DataFolderInUse, RunFolder, Store, estimate_bytes
+from daemon.storage.durable import Damaged
+from daemon.storage.frames import FrameRecord, FrameStore
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import DataFolderInUse, Store, estimate_bytes
 from drivers.clock import RealClock
 from protocol.errors import Code, UmbraError
-from protocol.messages import End, Product, RunState
-from protocol.scans import Checkerboard, Stick, TwoImage
+from protocol.messages.runs import End, Product, RunState
+from protocol.scans.occluded import Stick
+from protocol.scans.projected import Checkerboard, TwoImage
 
 
 class Calendar(RealClock):
@@ -133,7 +135,7 @@ def test_half_made_and_half_deleted_folders_are_swept_up(tmp_path: Path) -> None
 
 def test_two_daemons_never_share_a_folder(tmp_path: Path) -> None:
     code = (
-        "import sys, pathlib; from daemon.store import Store\n"
+        "import sys, pathlib; from daemon.storage.store import Store\n"
         "store = Store(pathlib.Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(

@@ -13,8 +13,10 @@ from daemon.scans.method import Bench, Taken, Watch
 from daemon.separation.estimator import Components, Observation
 from daemon.separation.radiometry import Response
 from daemon.separation.strength import SourceStrength
-from drivers.base import CameraInfo, PixelFormat, StageInfo
-from protocol.scans import Mesh
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.stage import StageInfo
+from protocol.scans.occluded import Mesh
 from tests.daemon.test_mesh import COVERING, DEEP, HEIGHT, MESH, WIDTH, circle, counts, errors
 
 TURN = 72

@@ -10,7 +10,9 @@ from daemon.separation.order_estimate import KEEP
 from daemon.separation.order_model import BLURS, RATIOS, fit, simulate
 from daemon.separation.radiometry import Response
 from daemon.separation.topk import TopK
-from protocol.scans import AnyScan, Checkerboard, Radiometry, RandomBinary
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import Checkerboard, RandomBinary
+from protocol.scans.spec import Radiometry
 from tests.daemon.scene import FULL, Scene
 
 NONE: tuple[()] = ()

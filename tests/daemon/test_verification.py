@@ -13,10 +13,12 @@ from daemon import patterns
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Digest, Expose, Taken, Unsuitable
 from daemon.separation.estimator import Measurement
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.patterns import WHITE, Checker, Unlit
-from protocol.scans import (
-    AnyScan,
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.verifications import (
     Point,
     VerifyCheckerSize,
     VerifyLitFraction,

@@ -5,7 +5,7 @@ The matrix of docs/theory.md, "Wrong parameters".
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -15,25 +15,25 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.scans import catalog
-from daemon.scans.method import Bench, Expose, Taken
-from daemon.separation.estimator import Components, Lighting
-from daemon.separation.frameset import UNCHECKED, FrameSet
+from daemon.scans.method import Expose, Taken
+from daemon.separation.estimator import Components, Lighting, Quality
+from daemon.separation.finish import Judgement, bits, finish
+from daemon.separation.frameset import UNCHECKED, Ceiling, FrameSet
 from daemon.separation.radiometry import Response
 from daemon.separation.single import block_mean
-from drivers.base import CameraInfo, PixelFormat
 from protocol.patterns import Axis
-from protocol.scans import (
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    PatternScan,
-    Radiometry,
     RandomBinary,
     RandomPhase,
-    Reference,
     SingleImage,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry, Reference
+from tests.daemon.scanning import declared
 from tests.daemon.scene import Scene
 
 Frames = list[NDArray[np.uint16]]
@@ -44,7 +44,7 @@ NONE: tuple[Reference, ...] = ()
 BLACK_WHITE = (Reference.BLACK, Reference.WHITE)
 BOTH = (Axis.X, Axis.Y)
 
-METHODS: dict[str, PatternScan] = {
+METHODS: dict[str, AnySeparation] = {
     "checkerboard": Checkerboard(radiometry=LIGHT),
     "checkerboard maxmin": Checkerboard(estimator="maxmin", radiometry=LIGHT),
     "random-binary": RandomBinary(radiometry=LIGHT),
@@ -78,10 +78,10 @@ def _of_right_scene(name: str, references: tuple[Reference, ...]) -> tuple[Frame
     return _taken(msgspec.structs.replace(METHODS[name], references=references), _scene())
 
 
-def _taken(spec: PatternScan, scene: Scene) -> tuple[Frames, Frames]:
+def _taken(spec: AnySeparation, scene: Scene) -> tuple[Frames, Frames]:
     """The frames of a scan: references, and patterns."""
     rng = np.random.default_rng(5)
-    method = catalog.method_for(spec, scene.bench())  # type: ignore[arg-type]
+    method = catalog.method_for(spec, scene.bench())
     references: Frames = []
     frames: Frames = []
     while (step := method.step(len(references) + len(frames), {})) is not None:
@@ -91,32 +91,17 @@ def _taken(spec: PatternScan, scene: Scene) -> tuple[Frames, Frames]:
     return references, frames
 
 
-def _declared(spec: PatternScan, frames: Sequence[NDArray[Any]]) -> Components:
-    """What a folder of frames comes to when it is said to be a scan."""
-    height, width = frames[0].shape
-    camera = CameraInfo(width, height, PixelFormat.MONO16, recorded=True, frame_count=len(frames))
-    method = catalog.method_for(spec, Bench(camera))  # type: ignore[arg-type]
-    estimator = method.estimator()
-    for index, frame in enumerate(frames):
-        step = method.step(index, {})
-        assert step is not None
-        estimator.update(frame, method.observe(step, Taken(index, 0, incomplete=False)))
-    found = estimator.result()
-    assert isinstance(found, Components)
-    return found
-
-
 def _judged(
     name: str,
     references: tuple[Reference, ...],
     wrong: Callable[[Frames], Frames] = lambda frames: frames,
     *,
     scene: Scene | None = None,
-    **declared: Any,
+    **changes: Any,
 ) -> Components:
     spec = msgspec.structs.replace(METHODS[name], references=references)
     first, frames = _taken(spec, scene) if scene else _of_right_scene(name, references)
-    return _declared(msgspec.structs.replace(spec, **declared), [*first, *wrong(frames)])
+    return declared(msgspec.structs.replace(spec, **changes), [*first, *wrong(frames)])
 
 
 def _advice(components: Components) -> list[str]:
@@ -167,7 +152,8 @@ def test_an_order_that_makes_no_difference_makes_none(
 
     right, wrong = _judged(name, references), _judged(name, references, back)
     assert _advice(wrong) == []
-    assert _error(wrong) == pytest.approx(_error(right), abs=0.002)
+    # noise is told by the first picture, and what is an edge by noise
+    assert _error(wrong) == pytest.approx(_error(right), abs=0.004)
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -252,7 +238,7 @@ def test_a_lamp_that_was_switched_on_after_the_references_is_told(name: str) -> 
 def test_black_and_white_exchanged_is_told(name: str) -> None:
     spec = msgspec.structs.replace(METHODS[name], references=BLACK_WHITE)
     first, frames = _taken(spec, _scene())
-    assert _says(_declared(spec, [*first[::-1], *frames]), "brighter than the white one")
+    assert _says(declared(spec, [*first[::-1], *frames]), "brighter than the white one")
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -301,7 +287,7 @@ def test_gray_code_without_inverses_is_told() -> None:
     spec = GrayCode(axes=BOTH, bits=6, references=NONE, radiometry=LIGHT)
     _, frames = _taken(spec, _scene())
     patterns = frames[::2]
-    found = _declared(GrayCode(bits=6, radiometry=LIGHT), patterns)
+    found = declared(GrayCode(bits=6, radiometry=LIGHT), patterns)
     assert _says(found, "add up to light")
 
 
@@ -329,3 +315,51 @@ def test_white_darker_than_the_patterns_and_black_brighter_are_told() -> None:
         pixels = rng.integers(level - 500, level + 500, (48, 64)).astype(np.uint16)
         frames.add(pixels, method.observe(step, Taken(index, 0, incomplete=False)))
     assert any("brighter than the white frame" in line for line in frames.told()[1])
+
+
+@pytest.mark.parametrize(
+    ("largest", "gain", "saturation", "words"),
+    [
+        (4095, 0.9, None, ("no sample is above", "--depth 12")),
+        (4095, 2.0, None, ("largest count of all, 4095", "--depth 12")),
+        (65520, 2.0, None, ("largest count of all, 65520", "--saturation 65520")),
+        (65520, 2.0, 65520.0, ()),
+        (4095, 2.0, 4095.0, ()),
+        (65535, 2.0, None, ()),
+        (65535, 0.9, None, ()),
+    ],
+)
+def test_a_scale_that_ends_below_16_bits_is_told(
+    largest: int, gain: float, saturation: float | None, words: tuple[str, ...]
+) -> None:
+    ceiling = Ceiling()
+    rng = np.random.default_rng(4)
+    for _ in range(3):
+        light = rng.normal(0.5, 0.12, (60, 80)).clip(0, 1) * gain
+        ceiling.add((light.clip(0, 1) * largest).astype(np.uint16))
+    told = ceiling.told(Response(65535, saturation=saturation))
+    assert len(told) == (1 if words else 0)
+    assert all(word in told[0] for word in words)
+
+
+@pytest.mark.parametrize(
+    ("limit", "edges", "words"),
+    [(30.0, False, "noise hides"), (3.0, True, "edges of the pattern"), (3.0, False, "in order")],
+)
+def test_what_most_pixels_lack_is_named(limit: float, edges: bool, words: str) -> None:
+    """Seven tenths of the pixels are lit, and have no direct light that is told from noise."""
+    light = np.full((20, 30), 100.0, dtype=np.float32)
+    lost = np.broadcast_to(np.arange(30) < 21, light.shape)
+    found = finish(
+        direct=np.where(lost, np.float32(0), np.float32(60)),
+        indirect=light.copy(),
+        response=Response(255),
+        brightest=light,
+        saturated=np.zeros(light.shape, dtype=np.bool_),
+        judgement=Judgement(*(np.full_like(light, x) for x in (limit, limit, limit / 3))),
+        flags=bits(lost, Quality.LOW_MODULATION) if edges else None,
+        facts={},
+    )
+    (line,) = found.facts["advice"]
+    assert "70.0% of the pixels that are lit at all cannot be separated" in line
+    assert words in line

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -11,22 +10,20 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.scans import catalog
-from daemon.scans.method import Bench, Expose, Taken, Unsuitable
+from daemon.scans.method import Expose, Unsuitable
 from daemon.separation.estimator import Components, Lighting, Quality
 from daemon.separation.frameset import UNCHECKED
-from drivers.base import CameraInfo, PixelFormat
-from protocol.scans import (
-    AnyScan,
-    AnySeparation,
+from protocol.scans.anyscan import AnyScan, AnySeparation
+from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
-    Radiometry,
     RandomBinary,
     RandomPhase,
-    Reference,
     Sinusoid,
     TwoImage,
 )
+from protocol.scans.spec import Radiometry, Reference
+from tests.daemon.scanning import declared
 from tests.daemon.scene import Scene
 
 LIGHT = Radiometry(leakage=0.02)
@@ -43,21 +40,6 @@ def _taken(spec: AnyScan, scene: Scene = SCENE) -> list[NDArray[np.uint16]]:
         assert isinstance(step, Expose)
         frames.append(scene.frame(step, rng))
     return frames
-
-
-def _declared(spec: AnyScan, frames: Sequence[NDArray[Any]]) -> Components:
-    """What a folder of frames comes to when it is said to be a scan."""
-    height, width = frames[0].shape
-    camera = CameraInfo(width, height, PixelFormat.MONO16, recorded=True, frame_count=len(frames))
-    method = catalog.method_for(spec, Bench(camera))
-    estimator = method.estimator()
-    for index, frame in enumerate(frames):
-        step = method.step(index, {})
-        assert step is not None
-        estimator.update(frame, method.observe(step, Taken(index, 0, incomplete=False)))
-    found = estimator.result()
-    assert isinstance(found, Components)
-    return found
 
 
 def _says(components: Components, words: str) -> bool:
@@ -101,29 +83,29 @@ def test_a_scan_as_declared_is_told_nothing(spec: AnySeparation, sigma: float) -
 def test_24_phases_are_not_several_periods(phases: int, periods: tuple[float, ...]) -> None:
     frames = _taken(Sinusoid(phases=24, references=(), radiometry=LIGHT))
     wrong = Sinusoid(phases=phases, periods=periods, radiometry=LIGHT)
-    assert _says(_declared(wrong, frames), "--phases, --periods")
+    assert _says(declared(wrong, frames), "--phases, --periods")
 
 
 def test_24_phases_are_not_8_of_2_periods_for_their_number() -> None:
     frames = _taken(Sinusoid(phases=24, references=(), radiometry=LIGHT))
     with pytest.raises(Unsuitable, match=r"has 24 images; 8 phases x 2 periods need 16"):
-        _declared(Sinusoid(phases=8, periods=(16, 20), radiometry=LIGHT), frames)
+        declared(Sinusoid(phases=8, periods=(16, 20), radiometry=LIGHT), frames)
 
 
 def test_a_checkerboard_is_no_sinusoid_and_the_reverse() -> None:
     checkers = _taken(Checkerboard(references=(), radiometry=LIGHT))
-    assert _says(_declared(Sinusoid(phases=25, radiometry=LIGHT), checkers), "from a sinusoid")
+    assert _says(declared(Sinusoid(phases=25, radiometry=LIGHT), checkers), "from a sinusoid")
     waves = _taken(Sinusoid(phases=25, references=(), radiometry=LIGHT))
-    assert _says(_declared(Checkerboard(radiometry=LIGHT), waves), "not the shifts")
+    assert _says(declared(Checkerboard(radiometry=LIGHT), waves), "not the shifts")
 
 
 def test_shifts_in_another_order_are_told() -> None:
     checkers = _taken(Checkerboard(references=(), radiometry=LIGHT))
     order = np.random.default_rng(2).permutation(25)
-    found = _declared(Checkerboard(radiometry=LIGHT), [checkers[n] for n in order])
+    found = declared(Checkerboard(radiometry=LIGHT), [checkers[n] for n in order])
     assert _says(found, "in their order")
     columns_first = [checkers[5 * (n % 5) + n // 5] for n in range(25)]
-    found = _declared(Checkerboard(radiometry=LIGHT), columns_first)
+    found = declared(Checkerboard(radiometry=LIGHT), columns_first)
     assert found.facts["advice"] == [UNCHECKED]
 
 

@@ -4,7 +4,7 @@ for what takes many scans."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -13,15 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon import patterns
-from daemon.scans import catalog
-from daemon.scans.method import Bench, Expose, Taken
+from daemon.scans.method import Bench, Expose
 from daemon.separation.estimator import Components
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from drivers.virtual.geometry import Pinhole
 from drivers.virtual.scene import TARGET
 from drivers.virtual.transport import Transport, transport
 from drivers.virtual.view import View, view
-from protocol.scans import AnyScan
+from protocol.patterns import AnyPattern
+from protocol.scans.anyscan import AnyScan
+from tests.daemon.scanning import scanned
 
 FULL = 4095
 BLACK = 64
@@ -40,6 +43,7 @@ class VirtualScene:
     level: float = 0.8  # of the scale, for radiance 1
     read: float = 1.2  # counts
     electrons: float = 10_500.0  # at full scale
+    _lit: dict[AnyPattern, NDArray[np.float32]] = field(default_factory=dict, init=False)
 
     @cached_property
     def operator(self) -> Transport:
@@ -75,7 +79,16 @@ class VirtualScene:
         """What the camera counts under a step's pattern."""
         light: NDArray[Any] = np.zeros((self.height, self.width), np.float32)
         if step.pattern is not None:
-            shown = patterns.render(step.pattern, self.width, self.height) / np.float32(255)
+            light = self._light(step.pattern)
+        counts = light * self.level * (FULL - BLACK) * ((step.exposure_us or OWN_US) / OWN_US)
+        shot = np.sqrt(np.maximum(counts, 0) * FULL / self.electrons)
+        noisy = counts + rng.standard_normal(counts.shape) * np.hypot(shot, self.read) + BLACK
+        return np.asarray(np.rint(np.clip(noisy, 0, FULL)), np.uint16)
+
+    def _light(self, pattern: AnyPattern) -> NDArray[np.float32]:
+        """Without noise, for radiance 1; kept for the next scan."""
+        if pattern not in self._lit:
+            shown = patterns.render(pattern, self.width, self.height) / np.float32(255)
             lit = self.leakage + (1 - self.leakage) * shown**self.gamma
             emitted = np.asarray(lit, np.float32)
             if self.defocus:
@@ -83,24 +96,10 @@ class VirtualScene:
                     emitted, (0, 0), self.defocus, borderType=cv2.BORDER_REPLICATE
                 )
                 emitted = np.asarray(blurred, np.float32)
-            light = np.add(*self.operator.render(self.operator.light(emitted), "RG"))
-        counts = light * self.level * (FULL - BLACK) * ((step.exposure_us or OWN_US) / OWN_US)
-        shot = np.sqrt(np.maximum(counts, 0) * FULL / self.electrons)
-        noisy = counts + rng.standard_normal(counts.shape) * np.hypot(shot, self.read) + BLACK
-        return np.asarray(np.rint(np.clip(noisy, 0, FULL)), np.uint16)
+            self._lit[pattern] = np.add(*self.operator.render(self.operator.light(emitted), "RG"))
+        return self._lit[pattern]
 
     def scan(self, spec: AnyScan, seed: int = 1) -> Components:
         """The whole of a scan, as the daemon does it."""
         rng = np.random.default_rng(seed)
-        method = catalog.method_for(spec, self.bench())
-        estimator = method.estimator()
-        index = 0
-        while (step := method.step(index, estimator.summary())) is not None:
-            assert isinstance(step, Expose)
-            for sub in range(step.frames):
-                observation = method.observe(step, Taken(index, sub, incomplete=False))
-                estimator.update(self.frame(step, rng), observation)
-            index += 1
-        components = estimator.result()
-        assert isinstance(components, Components)
-        return method.conclude(components)
+        return scanned(spec, self.bench(), lambda step: self.frame(step, rng))

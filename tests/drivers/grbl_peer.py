@@ -54,6 +54,7 @@ class Faults:
     drop_every: int = 0  # every so many-th query is not answered
     mute: bool = False  # says nothing at all, and hears nothing
     swallow_acks: int = 0  # the next so many oks are lost on the line
+    deaf_to: str = ""  # this line is lost on its way
     noise: list[bytes] = field(default_factory=list)  # goes out between answers
     switch_missing: bool = False  # homing finds no switch: ALARM:9
     homing_s: float = 0.1
@@ -158,6 +159,7 @@ class GrblPeer:
         self._v = 0.0
         self._holding = False
         self._jog_cancel = False
+        self._deaf = self._then_hold = False
         self._critical = False
         self._asked = False
         self._parsed = (self.x, self.y)  # where the parser believes to be
@@ -239,10 +241,14 @@ class GrblPeer:
                 self._asked = True
             elif byte == ord("!") and not self._critical:
                 self._hold()
+            elif byte == ord("~") and self._deaf:
+                self._deaf = False
             elif byte == ord("~") and self.state == "Hold" and self._v == 0:
                 self._holding = False
                 self.state = "Run" if self._blocks else "Idle"
             elif byte == 0x85 and self.state == "Jog":
+                # one that comes while the jog ends leaves Grbl idle and suspended, until ~
+                self._deaf = self._holding
                 self._holding = self._jog_cancel = True
         elif self._booting:
             return
@@ -254,6 +260,7 @@ class GrblPeer:
 
     def _hold(self) -> None:
         if self.state == "Jog":
+            self._then_hold = self._holding  # a second one holds what has stopped
             self._holding = self._jog_cancel = True
         elif self.state in {"Run", "Idle"}:
             self._holding = True
@@ -287,12 +294,16 @@ class GrblPeer:
         for _ in range(40):
             if self._critical or self.state == "Hold" or self._booting:
                 return
+            if self._deaf and self.state == "Idle":
+                return
             if self._running is None:
                 end = self._rx.find(b"\n")
                 if end < 0:
                     return
                 line = self._rx[:end].decode("ascii", "replace").strip()
                 del self._rx[: end + 1]
+                if line and line == self.faults.deaf_to:
+                    continue
                 self.lines.append(line)
                 self._running = self._execute(line)
             if next(self._running, True) is None:
@@ -539,7 +550,8 @@ class GrblPeer:
             self._blocks.clear()
             self._parsed = (self.x, self.y)
             self._holding = self._jog_cancel = False
-            self.state = "Idle"
+            self.state = "Hold" if self._then_hold else "Idle"
+            self._holding, self._then_hold = self._then_hold, False
         elif not self._blocks and self.state in {"Run", "Jog"}:
             if self._running is not None or self._rx:
                 self.starved += 1

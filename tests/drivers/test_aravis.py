@@ -14,16 +14,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from drivers.base import (
-    Acquisition,
-    CameraSettings,
-    Context,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, CameraSettings, Frame
+from drivers.base.device import Context
+from drivers.base.errors import DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.pixelformat import PixelFormat
 from drivers.registry import UnknownDriver, load
 
 try:
@@ -83,9 +77,10 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
-    made = Bench()
-    yield made
-    made.cut()
+    with aravis_peer.loopback():
+        made = Bench()
+        yield made
+        made.cut()
 
 
 @pytest.fixture

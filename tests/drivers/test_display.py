@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import Context, DeviceLost, DeviceRefused
+from drivers.base.device import Context
+from drivers.base.errors import DeviceLost, DeviceRefused
 from tests.drivers.xserver import screenshot, xvfb
 
 pytest.importorskip("pygame", reason="needs the extra: pip install 'umbra-rig[display]'")

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.devicethread import DeviceThread
-from drivers.base import Context, DeviceLost, DeviceRefused
+from daemon.devices.devicethread import DeviceThread
+from drivers.base.device import Context
+from drivers.base.errors import DeviceLost, DeviceRefused
 from tests.drivers.xserver import screenshot, xvfb
 
 pygame = pytest.importorskip("pygame", reason="needs the extra: pip install 'umbra-rig[display]'")
 
-from drivers import displaywindow  # noqa: E402
+from drivers import displaywindow, sdl  # noqa: E402
 from drivers.displaywindow import DisplayOptions, DisplayWindow  # noqa: E402
 
 WIDTH, HEIGHT = 640, 480
@@ -281,4 +282,4 @@ def test_connectors_are_named_in_the_kernels_order(tmp_path: Any) -> None:
         folder.mkdir()
         (folder / "status").write_text(status + "\n")
         (folder / "connector_id").write_text(number + "\n")
-    assert displaywindow._connectors(tmp_path) == ["eDP-1", "HDMI-A-1"]
+    assert sdl.connectors(tmp_path) == ["eDP-1", "HDMI-A-1"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -14,45 +13,21 @@ import pytest
 import usb.core
 from numpy.typing import NDArray
 
-from drivers import dlpc350, dlpc_hid, dmd
+from drivers import dlpc350, dlpc350_board, dlpc_hid, dmd
 from drivers import dlpc350_protocol as p
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    LoadedSequence,
-)
+from drivers.base.device import Context
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.projector import LoadedSequence
 from drivers.clock import NS, Clock
 from drivers.dlpc350 import Dlpc350Projector
 from drivers.registry import build
 from tests.drivers.dlpc350_peer import Board, Usb
 from tests.drivers.xserver import screenshot, xvfb
+from tests.jumping import Jumping
 
 SIZE = (dmd.ROWS, dmd.COLUMNS)
 Image = NDArray[np.uint8]
 BLACK, WHITE = np.zeros(SIZE, np.uint8), np.full(SIZE, 255, np.uint8)
-
-
-class Jumping(Clock):
-    """Time that passes only while somebody waits."""
-
-    def __init__(self) -> None:
-        self.now = NS
-
-    def now_ns(self) -> int:
-        return self.now
-
-    def utc_ns(self) -> int:
-        return self.now
-
-    def wait_until(self, deadline_ns: int, wake: threading.Event | None = None) -> bool:
-        if wake is not None and wake.is_set():
-            return True
-        self.now = max(self.now, deadline_ns)
-        return False
 
 
 @pytest.fixture(scope="module")
@@ -499,7 +474,7 @@ def hdmi(
 
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
     monkeypatch.setenv("DISPLAY", server)
-    monkeypatch.setattr(dlpc350, "POLL_S", 0.001)
+    monkeypatch.setattr(dlpc350_board, "POLL_S", 0.001)
     board.video = lambda: screenshot(server)
     device = make(RealClock(), flash=[], display={"latency_frames": 1.0}, layout="square")
     device.connect()

@@ -21,17 +21,10 @@ FOLDER = Path(tempfile.mkdtemp())
 atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
 os.environ["VCAMERADIR"] = str(FOLDER)  # read when the library is loaded
 
-from drivers.base import (  # noqa: E402
-    Acquisition,
-    CameraSettings,
-    Context,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, CameraSettings, Frame  # noqa: E402
+from drivers.base.device import Context  # noqa: E402
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout  # noqa: E402
+from drivers.base.pixelformat import PixelFormat  # noqa: E402
 from drivers.imagefile import BadImage  # noqa: E402
 from drivers.registry import UnknownDriver, load  # noqa: E402
 

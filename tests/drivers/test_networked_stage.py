@@ -16,7 +16,9 @@ import pytest
 import serial
 from serial import rfc2217
 
-from drivers.base import Context, DeviceLost, DeviceRefused, DeviceTimeout, StageState
+from drivers.base.device import Context
+from drivers.base.errors import DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.stage import StageState
 from drivers.clock import ScaledClock
 from drivers.grbl import GrblOptions, GrblStage
 from drivers.tmcl import TmclOptions, TmclStage

@@ -17,16 +17,10 @@ import pytest
 os.environ["PYLON_CAMEMU"] = "2"  # read when the SDK starts
 pytest.importorskip("pypylon", reason="pip install 'umbra-rig[pylon]'")
 
-from drivers.base import (
-    Acquisition,
-    CameraSettings,
-    Context,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, CameraSettings, Frame
+from drivers.base.device import Context
+from drivers.base.errors import DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.pixelformat import PixelFormat
 from drivers.pylon import PylonCamera, PylonOptions
 from drivers.registry import load
 

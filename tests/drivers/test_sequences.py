@@ -10,44 +10,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Context,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    LoadedSequence,
-    Projector,
-)
-from drivers.clock import NS, Clock, ScaledClock
+from drivers.base.camera import Acquisition, Frame
+from drivers.base.device import Context
+from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.projector import LoadedSequence, Projector
+from drivers.clock import Clock, ScaledClock
 from drivers.registry import build
 from drivers.sequence import mismatch
 from drivers.virtual.camera import VirtualCamera
 from drivers.virtual.faults import Fault
 from drivers.virtual.projector import VirtualProjector
+from tests.jumping import Jumping
 
 SIZE = (96, 128)
 COUNT = 12
 PERIOD_US = 4000.0
-
-
-class Jumping(Clock):
-    """Time that passes only while somebody waits: exact, for one thread."""
-
-    def __init__(self) -> None:
-        self.now = NS
-
-    def now_ns(self) -> int:
-        return self.now
-
-    def utc_ns(self) -> int:
-        return self.now
-
-    def wait_until(self, deadline_ns: int, wake: threading.Event | None = None) -> bool:
-        if wake is not None and wake.is_set():
-            return True
-        self.now = max(self.now, deadline_ns)
-        return False
 
 
 def stripes() -> list[NDArray[np.uint8]]:

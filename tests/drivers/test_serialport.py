@@ -21,7 +21,7 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from drivers import serialport
-from drivers.base import DeviceError, DeviceLost, DeviceRefused
+from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import RealClock
 from drivers.grbl import GrblStage
 from drivers.serialport import LONGEST_LINE, LineReader, SerialPort

@@ -13,16 +13,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    CameraSettings,
-    Context,
-    DeviceGarbled,
-    DeviceRefused,
-    Frame,
-    Identity,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, CameraSettings, Frame
+from drivers.base.device import Context, Identity
+from drivers.base.errors import DeviceGarbled, DeviceRefused
+from drivers.base.pixelformat import PixelFormat
 from drivers.clock import Clock
 from drivers.sfnc import LATCH_EVERY_NS, Nodes, SfncCamera, SfncOptions, Value
 from drivers.streaming import Buffer

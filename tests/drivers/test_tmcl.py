@@ -15,16 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import (
-    Context,
-    DeviceError,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    StageState,
-    StageStatus,
-)
+from drivers.base.device import Context
+from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.stage import StageState, StageStatus
 from drivers.tmcl import TmclOptions, TmclStage
 from drivers.tmcl_protocol import checksum, encode, find_answer
 from tests.drivers.tmcl_peer import TmclPeer
@@ -167,13 +160,9 @@ def test_circles_begin_at_angle_0_and_are_followed(peer: TmclPeer, reverse: bool
     stage.connect()
     stage.home(5.0)
     stage.circle((10.0, 5.0), R, 40.0, 1.25)
-    positions: list[tuple[float, float] | None] = []
-
-    def follow(status: StageStatus) -> bool:
-        positions.extend(stage.position_at(status.at_ns - ms * 10**6) for ms in (2, 20, 50, 80))
-        return at_rest(status)
-
-    status = pump_until(stage, follow)
+    begun_ns = stage.pump().at_ns
+    status = pump_until(stage, at_rest)
+    positions = [stage.position_at(ns) for ns in range(begun_ns, status.at_ns, 5_000_000)]
     assert status.position_mm == pytest.approx(point(math.pi / 2), abs=1e-3)
     assert peer.position == pytest.approx((-1 if reverse else 1) * 1.25 * TURN, abs=1)
     seen = [p for p in positions if p is not None]

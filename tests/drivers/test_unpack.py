@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import PixelFormat
+from drivers.base.pixelformat import PixelFormat
 from drivers.unpack import Layout, Packing, layout_of, unpack
 
 Pack = Callable[[list[int], int], bytes]

@@ -16,17 +16,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    CameraSettings,
-    Context,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    PixelFormat,
-)
+from drivers.base.camera import Acquisition, CameraSettings, Frame
+from drivers.base.device import Context
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.pixelformat import PixelFormat
 from drivers.registry import UnknownDriver, load
 
 try:

@@ -11,46 +11,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    CameraSettings,
-    Context,
-    DeviceGarbled,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    Frame,
-    PixelFormat,
-)
-from drivers.clock import NS, Clock, ScaledClock
+from drivers.base.camera import Acquisition, CameraSettings, Frame
+from drivers.base.device import Context
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.pixelformat import PixelFormat
+from drivers.clock import NS, ScaledClock
 from drivers.registry import build
 from drivers.virtual.camera import VirtualCamera
 from drivers.virtual.faults import Fault
 from drivers.virtual.projector import VirtualProjector
 from drivers.virtual.timeline import Forgotten, Timeline
+from tests.jumping import Jumping
 
 BLACK = np.zeros((96, 128), np.uint8)
 WHITE = np.full((96, 128), 255, np.uint8)
 LEFT = np.repeat(np.where(np.arange(128) < 64, 255, 0).astype(np.uint8)[None], 96, axis=0)
-
-
-class Jumping(Clock):
-    """Time that passes only while somebody waits: exact, for one thread."""
-
-    def __init__(self) -> None:
-        self.now = NS
-
-    def now_ns(self) -> int:
-        return self.now
-
-    def utc_ns(self) -> int:
-        return self.now + 1_700_000_000 * NS
-
-    def wait_until(self, deadline_ns: int, wake: threading.Event | None = None) -> bool:
-        if wake is not None and wake.is_set():
-            return True
-        self.now = max(self.now, deadline_ns)
-        return False
 
 
 def rig(

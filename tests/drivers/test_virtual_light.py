@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import Acquisition, CameraSettings, Context, PixelFormat
+from drivers.base.camera import Acquisition, CameraSettings
+from drivers.base.device import Context
+from drivers.base.pixelformat import PixelFormat
 from drivers.clock import ScaledClock
 from drivers.registry import build
 from drivers.virtual.camera import VirtualCamera

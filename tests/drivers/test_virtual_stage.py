@@ -11,14 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import (
-    Acquisition,
-    Context,
-    DeviceRefused,
-    DeviceTimeout,
-    StageState,
-)
-from drivers.clock import NS, Clock, ScaledClock
+from drivers.base.camera import Acquisition
+from drivers.base.device import Context
+from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.stage import StageState
+from drivers.clock import NS, ScaledClock
 from drivers.registry import build
 from drivers.virtual.camera import VirtualCamera
 from drivers.virtual.light import PIXELS, VirtualLight
@@ -27,25 +24,7 @@ from drivers.virtual.occluder import Occluder, OccluderKind, Shade
 from drivers.virtual.sky import Clouds
 from drivers.virtual.stage import VirtualStage
 from drivers.virtual.view import view
-
-
-class Jumping(Clock):
-    """Time that passes only while somebody waits: exact, for one thread."""
-
-    def __init__(self) -> None:
-        self.now = NS
-
-    def now_ns(self) -> int:
-        return self.now
-
-    def utc_ns(self) -> int:
-        return self.now + 1_700_000_000 * NS
-
-    def wait_until(self, deadline_ns: int, wake: threading.Event | None = None) -> bool:
-        if wake is not None and wake.is_set():
-            return True
-        self.now = max(self.now, deadline_ns)
-        return False
+from tests.jumping import Jumping
 
 
 def context() -> Context:

@@ -17,23 +17,28 @@ import numpy as np
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
-from protocol import messages as m
 from protocol.errors import Code, ErrorInfo, UmbraError
 from protocol.keys import KeyPair
-from protocol.messages import RunInfo, RunState
-from protocol.scans import AnyScan
+from protocol.messages import commands, replies
+from protocol.messages.access import Role
+from protocol.messages.envelopes import PROTOCOL, Event, Preamble, Request, Response
+from protocol.messages.events import AnyEvent, RunChanged
+from protocol.messages.findings import Check, Search
+from protocol.messages.rig import RigState, StageState
+from protocol.messages.runs import End, Product, RunInfo, RunState
+from protocol.scans.anyscan import AnyScan
 from protocol.wire import Arrays, decode, encode, headers
 
 T = TypeVar("T")
 UTC = "2026-01-01T00:00:00Z"
 Frames = list[bytes]
-STAGE = m.StageStatus(
-    state=m.StageState.IDLE,
+STAGE = replies.StageStatus(
+    state=StageState.IDLE,
     position_mm=(1.0, 2.0),
     travel_mm=((0.0, 100.0), (0.0, 50.0)),
     max_feed_mm_s=20.0,
 )
-_requests = msgspec.json.Decoder(m.Request)
+_requests = msgspec.json.Decoder(Request)
 
 
 class FakeRig:
@@ -46,26 +51,26 @@ class FakeRig:
         command: str = "tcp://127.0.0.1:0",
         events: str = "tcp://127.0.0.1:0",
         allow: list[bytes] | None = None,
-        protocol: int = m.PROTOCOL,
+        protocol: int = PROTOCOL,
     ) -> None:
         self.protocol = protocol
-        self.requests: list[m.Request] = []
-        self.done: list[m.Request] = []
+        self.requests: list[Request] = []
+        self.done: list[Request] = []
         self.drop = 0  # answers to swallow
         self.copies = 1  # how often each answer is sent
         self.hold_back = 0  # answers to send only together with the next one's
         self.before: list[Frames] = []  # messages to send ahead of the next answer
         self.mangle: Callable[[Frames], Frames] | None = None  # applied to each answer
-        self.on_request: Callable[[m.Request], object] | None = None
+        self.on_request: Callable[[Request], object] | None = None
         self.refuse: dict[str, ErrorInfo] = {}  # by command tag
         self.arrays: dict[str, np.ndarray[Any, Any]] = {
             "direct": np.arange(12, dtype=np.float32).reshape(3, 4),
             "global": np.full((3, 4), 2.5, np.float32),
         }
-        self.checks: tuple[m.Check, ...] = ()
+        self.checks: tuple[Check, ...] = ()
         self.files: dict[str, bytes] = {}
         self.runs: dict[str, RunInfo] = {}
-        self.lock: m.Locked | None = None
+        self.lock: replies.Locked | None = None
         self.renewed = threading.Event()
         self.finish_on_submit = False
         self.new_epoch()
@@ -119,15 +124,13 @@ class FakeRig:
         self._theirs.send(b"")
         return result.get(timeout=60)
 
-    def publish(
-        self, body: m.AnyEvent, arrays: Arrays | None = None, *, lose: bool = False
-    ) -> None:
+    def publish(self, body: AnyEvent, arrays: Arrays | None = None, *, lose: bool = False) -> None:
         """Send an event, or count it and lose it on the way."""
 
         def do() -> None:
             topic = type(body).topic
             self.sequences[topic] = self.sequences.get(topic, 0) + 1
-            event = m.Event(
+            event = Event(
                 topic=topic,
                 sequence=self.sequences[topic],
                 epoch=self.epoch,
@@ -153,7 +156,7 @@ class FakeRig:
 
         info = self.order(do)
         if tell:
-            self.publish(m.RunChanged(run=info), lose=lose)
+            self.publish(RunChanged(run=info), lose=lose)
         return info
 
     def await_subscribers(self, count: int) -> None:
@@ -186,20 +189,20 @@ class FakeRig:
                 self._answer(*self._router.recv_multipart())
 
     def _answer(self, identity: bytes, header: bytes, *_: bytes) -> None:
-        request: m.Request | None
+        request: Request | None
         try:
-            preamble = msgspec.json.decode(header, type=m.Preamble)
+            preamble = msgspec.json.decode(header, type=Preamble)
             self._check(preamble.protocol)
             request = decode(_requests, header)
             self.requests.append(request)
             if request.id not in self._answers:
                 self.done.append(request)
                 reply, arrays = self._reply(request)
-                response = m.Response(id=request.id, reply=reply, arrays=headers(arrays))
+                response = Response(id=request.id, reply=reply, arrays=headers(arrays))
                 self._answers[request.id] = encode(response, arrays)
             message = self._answers[request.id]
         except UmbraError as error:
-            message = encode(m.Response(id=preamble.id, error=error.info))
+            message = encode(Response(id=preamble.id, error=error.info))
             request = None
         if self.on_request is not None and request is not None:
             self.on_request(request)
@@ -228,85 +231,94 @@ class FakeRig:
             )
 
     def _reply(  # noqa: PLR0911, PLR0912  (a table of answers)
-        self, request: m.Request
-    ) -> tuple[m.AnyReply, dict[str, Any]]:
+        self, request: Request
+    ) -> tuple[replies.AnyReply, dict[str, Any]]:
         command = request.command
         tag = str(type(command).__struct_config__.tag)
         if tag in self.refuse:
             no = self.refuse[tag]
             raise UmbraError(no.code, no.message, no.where)
         match command:
-            case m.Hello():
-                return m.Welcome(
+            case commands.Hello():
+                return replies.Welcome(
                     protocol=self.protocol,
                     server="0.0-fake",
                     rig="fake",
                     epoch=self.epoch,
-                    role=m.Role.OPERATOR,
+                    role=Role.OPERATOR,
                     events=self.events.replace("127.0.0.1", "*"),
                     methods=("checkerboard",),
                     devices=("camera", "projector"),
                 ), {}
-            case m.GetStatus():
+            case commands.GetStatus():
                 return self._status(), {}
-            case m.GetDevices():
-                return m.Devices(devices=()), {}
-            case m.Submit(spec=spec, by=by):
-                return m.Run(run=self._submitted(spec, by)), {}
-            case m.Reprocess(run=run, by=by):
+            case commands.GetDevices():
+                return replies.Devices(devices=()), {}
+            case commands.Submit(spec=spec, by=by):
+                return replies.Run(run=self._submitted(spec, by)), {}
+            case commands.Reprocess(run=run, by=by):
                 made = self._submitted(self._run(run).spec, by)
                 made = self.runs[made.id] = msgspec.structs.replace(made, parents=(run,))
-                return m.Run(run=made), {}
-            case m.GetQueue() | m.ListRuns() | m.MoveQueued():
-                return m.Runs(runs=tuple(self.runs.values())), {}
-            case m.GetRun(run=run) | m.Pause(run=run) | m.Resume(run=run):
-                return m.Run(run=self._run(run)), {}
-            case m.Abort(run=run, by=by):
+                return replies.Run(run=made), {}
+            case commands.GetQueue() | commands.ListRuns() | commands.MoveQueued():
+                return replies.Runs(runs=tuple(self.runs.values())), {}
+            case commands.GetRun(run=run) | commands.Pause(run=run) | commands.Resume(run=run):
+                return replies.Run(run=self._run(run)), {}
+            case commands.Abort(run=run, by=by):
                 info = self._run(run)
-                end = m.End(state=RunState.ABORTED, reason=f"aborted by {by}", by=by)
+                end = End(state=RunState.ABORTED, reason=f"aborted by {by}", by=by)
                 self.runs[info.id] = msgspec.structs.replace(info, state=end.state, end=end)
-                return m.Run(run=self.runs[info.id]), {}
-            case m.GetResult(run=run):
+                return replies.Run(run=self.runs[info.id]), {}
+            case commands.GetResult(run=run):
                 info = self._run(run)
                 final = info.state is RunState.DONE
-                return m.Result(run=info, final=final, facts={"images": 25}), self.arrays
-            case m.GetProduct(name=name, offset=offset, limit=limit):
+                return replies.Result(run=info, final=final, facts={"images": 25}), self.arrays
+            case commands.GetProduct(name=name, offset=offset, limit=limit):
                 data = self.files[name]
                 part = np.frombuffer(data[offset : offset + limit], np.uint8)
-                product = m.Product(name=name, kind="image", file=name, bytes=len(data))
-                reply = m.ProductPart(product=product, offset=offset, size=len(data))
+                product = Product(name=name, kind="image", file=name, bytes=len(data))
+                reply = replies.ProductPart(product=product, offset=offset, size=len(data))
                 return reply, {"data": part}
-            case m.GetLog():
-                return m.Log(records=({"event": "hello"},)), {}
-            case m.GetPreview() | m.Snap():
-                name = "preview" if isinstance(command, m.GetPreview) else "frame"
-                return m.Picture(facts={"saturated": 0}), {name: np.zeros((4, 4, 3), np.uint8)}
-            case m.SetCamera(settings=settings, auto_exposure=auto):
+            case commands.GetLog():
+                return replies.Log(records=({"event": "hello"},)), {}
+            case commands.Draw():
+                facts = {"images": 27, "lighting": "black"}
+                return replies.Picture(facts=facts), {"png": np.zeros(8, np.uint8)}
+            case commands.GetPreview() | commands.Snap():
+                name = "preview" if isinstance(command, commands.GetPreview) else "frame"
+                return replies.Picture(facts={"saturated": 0}), {
+                    name: np.zeros((4, 4, 3), np.uint8)
+                }
+            case commands.SetCamera(settings=settings, auto_exposure=auto):
                 facts = {"exposure_us": 400.0, "brightest": 0.55, "problem": "too dark"}
-                return m.Camera(settings=settings, facts=facts if auto else {}), {}
+                return replies.Camera(settings=settings, facts=facts if auto else {}), {}
             case (
-                m.GetStage() | m.StageHome() | m.StageMove() | m.StageCircle() | m.StageStop()
-                | m.StageUnlock()
-            ):  # fmt: skip
+                commands.GetStage()
+                | commands.StageHome()
+                | commands.StageMove()
+                | commands.StageCircle()
+                | commands.StageStop()
+                | commands.StageUnlock()
+            ):
                 return STAGE, {}
-            case m.Discover(drivers=drivers):
-                return m.Discovered(
-                    searches=tuple(m.Search(kind="camera", driver=d) for d in drivers)
+            case commands.Discover(drivers=drivers):
+                return replies.Discovered(
+                    searches=tuple(Search(kind="camera", driver=d) for d in drivers)
                 ), {}
-            case m.Examine():
-                return m.Examined(checks=self.checks), {}
-            case m.Lock(lease_s=lease_s):
-                self.lock = m.Locked(token=uuid.uuid4().hex, lease_s=lease_s)
+            case commands.Examine():
+                return replies.Examined(checks=self.checks), {}
+            case commands.Lock(lease_s=lease_s):
+                self.lock = replies.Locked(token=uuid.uuid4().hex, lease_s=lease_s)
                 return self.lock, {}
-            case m.RenewLock() | m.Unlock():
+            case commands.RenewLock() | commands.Unlock():
                 if self.lock is None or request.token != self.lock.token:
                     raise UmbraError(Code.LOCKED, "you don't hold the rig: lock it again")
-                if isinstance(command, m.Unlock):
+                if isinstance(command, commands.Unlock):
                     self.lock = None
                 else:
                     self.renewed.set()
                     return self.lock, {}
-        return m.Done(), {}
+        return replies.Done(), {}
 
     def _submitted(self, spec: AnyScan, by: str) -> RunInfo:
         state = RunState.DONE if self.finish_on_submit else RunState.QUEUED
@@ -322,10 +334,10 @@ class FakeRig:
             raise UmbraError(Code.UNKNOWN_RUN, f"there is no run {run!r}: see 'umbra runs'")
         return found
 
-    def _status(self) -> m.Status:
-        return m.Status(
+    def _status(self) -> replies.Status:
+        return replies.Status(
             rig="fake",
-            state=m.RigState.IDLE,
+            state=RigState.IDLE,
             epoch=self.epoch,
             uptime_s=1.0,
             devices=(),

@@ -13,15 +13,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from protocol import messages as m
 from protocol.cli.app import SECTIONS, run
 from protocol.cli.exits import Exit, exit_of
 from protocol.cli.rig import _followed
 from protocol.cli.watch import show_progress
 from protocol.connection import Notice
 from protocol.errors import Code, ErrorInfo, UmbraError
-from protocol.messages import RunState
-from protocol.scans import Checkerboard, Radiometry, Reference, TwoImage
+from protocol.messages import commands, replies
+from protocol.messages.envelopes import Event, Request
+from protocol.messages.events import Logged
+from protocol.messages.findings import Check, Outcome
+from protocol.messages.rig import CameraSettings, DeviceInfo, Health
+from protocol.messages.runs import End, Product, Progress, RunInfo, RunState
+from protocol.scans.projected import Checkerboard, TwoImage
+from protocol.scans.spec import Radiometry, Reference
 from tests.protocol.fake import FakeRig
 
 Captured = pytest.CaptureFixture[str]
@@ -30,15 +35,15 @@ Captured = pytest.CaptureFixture[str]
 class Rig(FakeRig):
     """A fake rig with a camera, and products to fetch."""
 
-    def _status(self) -> m.Status:
-        camera = m.DeviceInfo(
-            name="camera", kind="camera", driver="virtual", health=m.Health.READY, model="V1"
+    def _status(self) -> replies.Status:
+        camera = DeviceInfo(
+            name="camera", kind="camera", driver="virtual", health=Health.READY, model="V1"
         )
         return msgspec.structs.replace(super()._status(), devices=(camera,))
 
     broken = ""  # a product that cannot be read
 
-    def _reply(self, request: m.Request) -> tuple[m.AnyReply, dict[str, Any]]:
+    def _reply(self, request: Request) -> tuple[replies.AnyReply, dict[str, Any]]:
         if self.broken and getattr(request.command, "name", "") == self.broken:
             raise UmbraError(Code.STORAGE_FAILED, "disk gone")
         return super()._reply(request)
@@ -46,7 +51,7 @@ class Rig(FakeRig):
     def make(self, *names: str) -> None:
         """A run that is done, with these products."""
         self.files = {name: name.encode() * 1000 for name in names}
-        products = tuple(m.Product(name=n, kind="image", file=f"{n}.tiff") for n in names)
+        products = tuple(Product(name=n, kind="image", file=f"{n}.tiff") for n in names)
         self._submitted(Checkerboard(), "me")
         self.runs["run-1"] = msgspec.structs.replace(
             self.runs["run-1"], state=RunState.DONE, products=products
@@ -173,25 +178,25 @@ def test_every_code_has_its_exit() -> None:
 @pytest.mark.parametrize(
     ("arguments", "kind"),
     [
-        (["status"], m.Status),
-        (["devices"], m.Devices),
-        (["methods"], m.Welcome),
-        (["runs"], m.Runs),
-        (["run"], m.Run),
-        (["queue"], m.Runs),
-        (["queue", "move", "run-1", "0"], m.Runs),
-        (["pause"], m.Run),
-        (["resume"], m.Run),
-        (["abort"], m.Run),
-        (["log"], m.Log),
-        (["preview"], m.Picture),
-        (["camera"], m.Camera),
-        (["light", "left", "on"], m.Done),
-        (["show", "white"], m.Done),
-        (["show", "off"], m.Done),
-        (["stop"], m.Done),
-        (["reset"], m.Done),
-        (["scan", "two-image"], m.Run),
+        (["status"], replies.Status),
+        (["devices"], replies.Devices),
+        (["methods"], replies.Welcome),
+        (["runs"], replies.Runs),
+        (["run"], replies.Run),
+        (["queue"], replies.Runs),
+        (["queue", "move", "run-1", "0"], replies.Runs),
+        (["pause"], replies.Run),
+        (["resume"], replies.Run),
+        (["abort"], replies.Run),
+        (["log"], replies.Log),
+        (["preview"], replies.Picture),
+        (["camera"], replies.Camera),
+        (["light", "left", "on"], replies.Done),
+        (["show", "white"], replies.Done),
+        (["show", "off"], replies.Done),
+        (["stop"], replies.Done),
+        (["reset"], replies.Done),
+        (["scan", "two-image"], replies.Run),
     ],
 )
 def test_json_is_the_protocols_own_struct(
@@ -238,7 +243,7 @@ def test_tables_are_plain_in_a_pipe_and_coloured_on_a_terminal(
 def test_scan_options_become_the_spec(rig: Rig, capsys: Captured) -> None:
     given = ["--checker", "6", "--shifts=4", "--tone", "gamma:2.2", "--leak", "0.02", "--first"]
     assert run(["scan", "checkerboard", *given, "--references", "black,white"]) == Exit.OK
-    submitted = asked(rig, m.Submit)
+    submitted = asked(rig, commands.Submit)
     assert submitted.first
     assert submitted.spec == Checkerboard(
         checker=6,
@@ -259,7 +264,7 @@ def test_scan_options_become_the_spec(rig: Rig, capsys: Captured) -> None:
 def test_a_scan_from_a_file(name: str, text: str, rig: Rig, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
     assert run(["scan", "--file", str(tmp_path / name), "--first"]) == Exit.OK
-    submitted = asked(rig, m.Submit)
+    submitted = asked(rig, commands.Submit)
     assert submitted.first
     assert submitted.spec == Checkerboard(shifts=4, radiometry=Radiometry(tone="srgb"))
 
@@ -294,7 +299,7 @@ def test_scan_options_before_the_method_are_not_lost(rig: Rig, capsys: Captured)
 
 def test_scan_without_options_is_the_default(rig: Rig) -> None:
     assert run(["scan", "two-image"]) == Exit.OK
-    assert asked(rig, m.Submit).spec == TwoImage()
+    assert asked(rig, commands.Submit).spec == TwoImage()
 
 
 @pytest.mark.parametrize(
@@ -311,7 +316,7 @@ def test_waiting_exits_as_the_run_ended(
 ) -> None:
     def go_on() -> None:
         assert rig.subscribed.acquire(timeout=10)
-        end = m.End(state=state, reason="as the test said", by="me")
+        end = End(state=state, reason="as the test said", by="me")
         rig.change("run-1", state=state, end=end, recorded=25)
 
     thread = threading.Thread(target=go_on)
@@ -327,9 +332,9 @@ def test_waiting_exits_as_the_run_ended(
         assert told == f"umbra: run run-1 {state.value}: as the test said by me"
 
 
-def news() -> Iterator[m.Progress]:
+def news() -> Iterator[Progress]:
     for n in range(26):
-        yield m.Progress(
+        yield Progress(
             run="run-1", state=RunState.RUNNING, recorded=n, planned=25, missing=0, rejected=0,
             fraction=n / 25, rate_hz=10.0, remaining_s=(25 - n) / 10, phase="exposing",
         )  # fmt: skip
@@ -362,21 +367,21 @@ def test_ctrl_c_while_waiting_says_that_the_run_goes_on(
     monkeypatch.setattr("protocol.cli.scan.follow", interrupted)
     assert run(["scan", "checkerboard", "--wait"]) == Exit.INTERRUPTED
     assert "run run-1 goes on; umbra watch run-1" in capsys.readouterr().err
-    assert not any(isinstance(r.command, m.Abort) for r in rig.requests)
+    assert not any(isinstance(r.command, commands.Abort) for r in rig.requests)
 
 
 def test_watch_as_json_is_a_line_an_event(rig: Rig, capsys: Captured) -> None:
     rig.make("direct")
     assert run(["watch", "--json"]) == Exit.OK
     first, *_, last = capsys.readouterr().out.splitlines()
-    assert msgspec.json.decode(first, type=m.Progress).state is RunState.DONE
-    assert msgspec.json.decode(last, type=m.RunInfo).id == "run-1"
+    assert msgspec.json.decode(first, type=Progress).state is RunState.DONE
+    assert msgspec.json.decode(last, type=RunInfo).id == "run-1"
 
 
 def test_steering_without_a_run_names_the_one_it_means(rig: Rig) -> None:
     rig.make("direct")
     assert run(["abort"]) == Exit.OK
-    assert asked(rig, m.Abort).run == "run-1"
+    assert asked(rig, commands.Abort).run == "run-1"
 
 
 # ---------------------------------------------------------------- products
@@ -442,13 +447,13 @@ def test_preview_to_a_file(rig: Rig, tmp_path: Path) -> None:
 
 def test_show_a_pattern(rig: Rig) -> None:
     assert run(["show", "checker", "--size", "4", "--inverted", "--for", "5"]) == Exit.OK
-    shown = asked(rig, m.Show)
+    shown = asked(rig, commands.Show)
     assert (shown.pattern.size, shown.pattern.inverted, shown.lease_s) == (4, True, 5.0)
 
 
 def test_camera_settings(rig: Rig, capsys: Captured) -> None:
     assert run(["camera", "--exposure-us", "500", "--roi", "0,0,64,48"]) == Exit.OK
-    assert asked(rig, m.SetCamera).settings == m.CameraSettings(
+    assert asked(rig, commands.SetCamera).settings == CameraSettings(
         exposure_us=500.0, roi=(0, 0, 64, 48)
     )
     assert "exposure  500 µs" in capsys.readouterr().out
@@ -471,11 +476,11 @@ def test_keys_from_new_to_revoked(tmp_path: Path, capsys: Captured) -> None:
 
 def test_auto_exposure_is_asked_for_after_the_other_settings(rig: Rig, capsys: Captured) -> None:
     assert run(["camera", "--auto-exposure", "--exposure-us", "500", "--gain", "6"]) == Exit.OK
-    sent = [r.command for r in rig.requests if isinstance(r.command, m.SetCamera)]
+    sent = [r.command for r in rig.requests if isinstance(r.command, commands.SetCamera)]
     assert sent == [
-        m.SetCamera(settings=m.CameraSettings(gain=6.0)),
-        m.SetCamera(settings=m.CameraSettings(exposure_us=500.0), auto_exposure=True),
-        m.SetCamera(),
+        commands.SetCamera(settings=CameraSettings(gain=6.0)),
+        commands.SetCamera(settings=CameraSettings(exposure_us=500.0), auto_exposure=True),
+        commands.SetCamera(),
     ]
     told = capsys.readouterr()
     assert "55.0% of full scale" in told.out
@@ -487,29 +492,29 @@ def test_auto_exposure_is_asked_for_after_the_other_settings(rig: Rig, capsys: C
 
 def test_stage_moves_are_asked_for_as_they_are_typed(rig: Rig, capsys: Captured) -> None:
     assert run(["stage", "circle", "10", "12.5", "3", "--turns", "2", "--feed", "4"]) == Exit.OK
-    circle = asked(rig, m.StageCircle)
+    circle = asked(rig, commands.StageCircle)
     assert (circle.centre_mm, circle.radius_mm, circle.feed_mm_s) == ((10.0, 12.5), 3.0, 4.0)
     assert run(["stage", "move", "10", "12"]) == Exit.OK
-    assert asked(rig, m.StageMove).feed_mm_s == 10.0  # half of the fastest
+    assert asked(rig, commands.StageMove).feed_mm_s == 10.0  # half of the fastest
     assert "1.000, 2.000 mm" in capsys.readouterr().out
     assert run(["stage", "move", "-10.5", "-12", "--feed", "4"]) == Exit.OK  # no option
-    there = asked(rig, m.StageMove)
+    there = asked(rig, commands.StageMove)
     assert (there.x_mm, there.y_mm) == (-10.5, -12.0)
     assert run(["stage", "home", "--timeout", "7"]) == Exit.OK
-    assert asked(rig, m.StageHome).timeout_s == 7.0
+    assert asked(rig, commands.StageHome).timeout_s == 7.0
     assert run(["stage", "circle", "1", "2", "3", "--wait"]) == Exit.USAGE  # it has no end
 
 
 def test_the_doctor_exits_as_he_found(rig: Rig, capsys: Captured) -> None:
-    fine = m.Check(name="keys", outcome=m.Outcome.OK, message="good", remedy="")
-    poor = m.Check(name="disk", outcome=m.Outcome.WARNING, message="slow", remedy="buy another")
+    fine = Check(name="keys", outcome=Outcome.OK, message="good", remedy="")
+    poor = Check(name="disk", outcome=Outcome.WARNING, message="slow", remedy="buy another")
     rig.checks = (fine, poor)
     assert run(["doctor", "--passive"]) == Exit.OK
-    assert asked(rig, m.Examine).passive
+    assert asked(rig, commands.Examine).passive
     out = capsys.readouterr().out
     assert "warning  disk  slow\n               -> buy another\n" in out
     assert out.endswith("1 ok, 1 warning\n")
-    rig.checks = (fine, msgspec.structs.replace(poor, outcome=m.Outcome.FAILED))
+    rig.checks = (fine, msgspec.structs.replace(poor, outcome=Outcome.FAILED))
     assert run(["doctor"]) == Exit.FAILED
 
 
@@ -518,8 +523,8 @@ def test_a_log_that_goes_on() -> None:
         return {"event": event, "run": run}
 
     def notice(event: str, run: str = "", *, gap: bool = False) -> Notice:
-        body = m.Logged(record=record(event, run))
-        told = m.Event(topic="log", sequence=1, epoch="e", utc="", body=body)
+        body = Logged(record=record(event, run))
+        told = Event(topic="log", sequence=1, epoch="e", utc="", body=body)
         return Notice(event=told, arrays={}, gap=gap)
 
     came = iter([notice("one"), notice("two"), notice("four", gap=True), None, notice("six")])
@@ -553,9 +558,7 @@ def test_a_runs_log_that_goes_on_is_of_that_run() -> None:
 
     class Events:
         def next(self, timeout_s: float) -> Notice:
-            told = m.Event(
-                topic="log", sequence=1, epoch="e", utc="", body=m.Logged(record=next(came))
-            )
+            told = Event(topic="log", sequence=1, epoch="e", utc="", body=Logged(record=next(came)))
             return Notice(event=told, arrays={}, gap=False)
 
     class Client:

@@ -150,5 +150,5 @@ def test_what_a_quick_command_does_not_import(arguments: list[str], absent: list
 
 
 def test_a_recordings_keys_are_named_as_they_were_typed() -> None:
-    said = as_typed("no images that match 'x*'; check `path` and `match`, leave `bits` out")
-    assert said == "no images that match 'x*'; check DIR and --match, leave `bits` out"
+    said = as_typed("no images that match 'x*'; check `path` and `match`, leave `loop` out")
+    assert said == "no images that match 'x*'; check DIR and --match, leave `loop` out"

@@ -13,7 +13,9 @@ from protocol.cli.app import command_of
 from protocol.cli.family import Family, members
 from protocol.cli.options import build, options_of
 from protocol.errors import UmbraError
-from protocol.scans import AnyScan, Checkerboard, Point, VerifyPatchSize
+from protocol.scans.anyscan import AnyScan
+from protocol.scans.projected import Checkerboard
+from protocol.scans.verifications import Point, VerifyPatchSize
 
 
 class Mode(enum.StrEnum):
@@ -113,7 +115,7 @@ def test_a_struct_that_joins_the_union_is_a_command(capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize("tag", members(AnyScan))
 def test_every_method_of_the_protocol_has_options_with_help(tag: str) -> None:
     for option in options_of(members(AnyScan)[tag]):
-        assert option.help, f"{tag}: {option.flag} has no description in protocol/scans.py"
+        assert option.help, f"{tag}: {option.flag} has no description in protocol/scans"
 
 
 def test_own_fields_come_first() -> None:

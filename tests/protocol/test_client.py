@@ -18,25 +18,29 @@ import numpy as np
 import pytest
 import zmq
 
-from protocol import messages as m
 from protocol.client import Client
 from protocol.commands import Commands
 from protocol.connection import ATTEMPTS, Ask, Exchange, chosen_endpoint, events_endpoint, is_local
 from protocol.errors import Code, ErrorInfo, UmbraError
-from protocol.messages import GetResult
+from protocol.messages import commands, replies
+from protocol.messages.access import DEFAULT_COMMAND, Role
+from protocol.messages.commands import GetResult
+from protocol.messages.envelopes import ArrayHeader, Request, Response
+from protocol.messages.findings import Search
+from protocol.messages.runs import End, RunInfo, RunState
 from protocol.patterns import WHITE
 from protocol.results import separation_of
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 from tests.protocol.fake import STAGE, FakeRig
 
 Connect = Callable[..., Client]
 
 
-def sent(fake: FakeRig, kind: type[m.Command]) -> list[m.Request]:
+def sent(fake: FakeRig, kind: type[commands.Command]) -> list[Request]:
     return [r for r in fake.requests if isinstance(r.command, kind)]
 
 
-def done(fake: FakeRig, kind: type[m.Command]) -> list[m.Request]:
+def done(fake: FakeRig, kind: type[commands.Command]) -> list[Request]:
     return [r for r in fake.done if isinstance(r.command, kind)]
 
 
@@ -49,8 +53,8 @@ def test_each_command_has_a_method_and_the_answer_it_names(fake: FakeRig, rig: C
     assert run.by == "me"
     again = rig.reprocess(run.id, calibration="now", leakage=0.1, periods=(4.0, 8.0))
     assert again.info.parents == (run.id,)
-    (asked,) = sent(fake, m.Reprocess)
-    assert asked.command == m.Reprocess(
+    (asked,) = sent(fake, commands.Reprocess)
+    assert asked.command == commands.Reprocess(
         run=run.id, calibration="now", changes={"leakage": 0.1, "periods": [4.0, 8.0]}, by="me"
     )
     fake.runs.pop(again.id)
@@ -58,27 +62,28 @@ def test_each_command_has_a_method_and_the_answer_it_names(fake: FakeRig, rig: C
     assert rig.devices() == ()
     assert rig.queue() == rig.runs() == rig.move_queued(run.id, 0) == (run,)
     assert rig.pause(run.id) == rig.resume(run.id) == rig.run_info(run.id) == run
-    assert rig.abort(run.id).end == m.End(state=m.RunState.ABORTED, reason="aborted by me", by="me")
+    assert rig.abort(run.id).end == End(state=RunState.ABORTED, reason="aborted by me", by="me")
     assert rig.estop() == rig.reset() == rig.show(WHITE) == rig.light("left", on=True) == ""
     assert rig.dark() == rig.live() == rig.stop_live() == ""
     assert bytes(rig.product_part(run.id, "direct", 1).data) == b"bc"
     assert rig.log() == ({"event": "hello"},)
     assert rig.preview().pixels.shape == rig.snap().pixels.shape == (4, 4, 3)
+    assert rig.draw(Checkerboard(), 0, 64, 48).facts["images"] == 27
     assert rig.camera(gain=2.0).gain == 2.0
     assert rig.stage() == rig.stage_home() == rig.stage_move(1, 2, 3) == STAGE
     assert rig.stage_circle((9, 9), 3, 2) == rig.stage_stop() == rig.stage_unlock() == STAGE
-    assert rig.discover("pylon") == (m.Search(kind="camera", driver="pylon"),)
+    assert rig.discover("pylon") == (Search(kind="camera", driver="pylon"),)
     assert rig.examine() == ()
     rig.token = rig.lock("me").token
     assert rig.renew_lock().lease_s == 10.0
     assert rig.unlock() == ""
     used = {type(request.command) for request in fake.requests}
-    assert used == set(m.ANSWERS) - {GetResult}
+    assert used == set(replies.ANSWERS) - {GetResult}
 
 
 def test_every_command_is_in_the_table_of_answers() -> None:
-    assert set(m.ANSWERS) == set(m.AnyCommand.__args__)
-    assert set(m.ANSWERS.values()) <= set(m.AnyReply.__args__)
+    assert set(replies.ANSWERS) == set(commands.AnyCommand.__args__)
+    assert set(replies.ANSWERS.values()) <= set(replies.AnyReply.__args__)
 
 
 def test_methods_show_their_signature_and_docstring(fake: FakeRig) -> None:
@@ -96,7 +101,7 @@ def test_the_daemons_error_is_raised_as_it_is(fake: FakeRig, rig: Client) -> Non
     with pytest.raises(UmbraError, match=">= 1") as caught:
         rig.submit(Checkerboard())
     assert caught.value.info == fake.refuse["submit"]
-    assert len(sent(fake, m.Submit)) == 1  # an error is an answer: nothing is repeated
+    assert len(sent(fake, commands.Submit)) == 1  # an error is an answer: nothing is repeated
 
 
 # ---------------------------------------------------------------- repeats
@@ -108,7 +113,7 @@ def test_a_lost_answer_is_asked_for_again_under_the_same_id(
 ) -> None:
     fake.drop = lost
     run = hasty.submit(Checkerboard())
-    requests = sent(fake, m.Submit)
+    requests = sent(fake, commands.Submit)
     assert len(requests) == lost + 1
     assert len({r.id for r in requests}) == 1
     assert list(fake.runs) == [run.id]  # carried out once
@@ -119,7 +124,7 @@ def test_after_the_last_attempt_the_error_says_what_to_do(fake: FakeRig, hasty: 
     with pytest.raises(UmbraError, match="is umbrad running") as caught:
         hasty.status()
     assert caught.value.code is Code.UNREACHABLE
-    assert len(sent(fake, m.GetStatus)) == ATTEMPTS
+    assert len(sent(fake, commands.GetStatus)) == ATTEMPTS
     assert "\n" not in caught.value.message
     assert fake.endpoint in caught.value.message
     assert "UMBRA_RIG" in caught.value.message
@@ -141,11 +146,11 @@ def test_answers_that_come_twice_are_taken_once(fake: FakeRig, rig: Client) -> N
 
 
 def test_stray_and_garbled_messages_are_passed_over(fake: FakeRig, rig: Client) -> None:
-    stray = msgspec.json.encode(m.Response(id="someone-else", reply=m.Done()))
+    stray = msgspec.json.encode(Response(id="someone-else", reply=replies.Done()))
     fake.before = [[b""], [b"\xff\x00"], [b"{}", b"x"], [b'{"id": 3}'], [b"[1"], [stray, b"y"]]
     assert rig.status().rig == "fake"
     assert rig.devices() == ()
-    assert len(sent(fake, m.GetStatus)) == 1
+    assert len(sent(fake, commands.GetStatus)) == 1
 
 
 def test_an_answer_that_cannot_be_read_is_an_error_at_once(fake: FakeRig, rig: Client) -> None:
@@ -153,7 +158,7 @@ def test_an_answer_that_cannot_be_read_is_an_error_at_once(fake: FakeRig, rig: C
     with pytest.raises(UmbraError, match="rug") as caught:
         rig.status()
     assert caught.value.code is Code.INTERNAL
-    assert len(sent(fake, m.GetStatus)) == 1
+    assert len(sent(fake, commands.GetStatus)) == 1
 
 
 @pytest.mark.parametrize(
@@ -178,7 +183,7 @@ def test_arrays_that_are_not_as_announced(
 
 
 def test_another_kind_of_reply_is_an_error(fake: FakeRig, rig: Client) -> None:
-    request_done = msgspec.json.encode(m.Done())
+    request_done = msgspec.json.encode(replies.Done())
 
     def another(frames: list[bytes]) -> list[bytes]:
         answer = msgspec.json.decode(frames[0])
@@ -279,7 +284,7 @@ async def test_requests_of_one_loop_overlap(fake: FakeRig) -> None:
         answers = await asyncio.gather(
             *(rig.status() if i % 2 else rig.run_info(run.id) for i in range(40))
         )
-    assert [type(a) for a in answers] == [m.RunInfo, m.Status] * 20
+    assert [type(a) for a in answers] == [RunInfo, replies.Status] * 20
 
 
 async def test_a_cancelled_request_leaves_nothing_behind(fake: FakeRig) -> None:
@@ -341,11 +346,11 @@ def test_nothing_is_left_running(fake: FakeRig, connect: Connect) -> None:
 def test_result_is_a_view_of_what_was_received() -> None:
     direct = np.arange(600_000, dtype=np.float32).reshape(400, 500, 3)
     exchange = Exchange(Ask(GetResult(), separation_of))
-    info = m.RunInfo(id="r", state=m.RunState.DONE, spec=Checkerboard(), submitted="")
+    info = RunInfo(id="r", state=RunState.DONE, spec=Checkerboard(), submitted="")
     arrays = tuple(
-        m.ArrayHeader(name=n, dtype="float32", shape=direct.shape) for n in ("direct", "global")
+        ArrayHeader(name=n, dtype="float32", shape=direct.shape) for n in ("direct", "global")
     )
-    response = m.Response(id=exchange.id, reply=m.Result(run=info, final=True), arrays=arrays)
+    response = Response(id=exchange.id, reply=replies.Result(run=info, final=True), arrays=arrays)
     frames = [zmq.Frame(b) for b in (msgspec.json.encode(response), direct.tobytes(), direct.data)]
     result = exchange.value(frames)
     for array, frame in zip((result.direct, result.global_), frames[1:], strict=True):
@@ -383,7 +388,7 @@ def test_download_puts_parts_together(fake: FakeRig, rig: Client, tmp_path: Path
     assert (tmp_path / "direct.tiff").read_bytes() == whole
     assert (tmp_path / "new" / "other.tiff").read_bytes() == whole
     assert (tmp_path / "empty.json").read_bytes() == b""
-    assert len(sent(fake, m.GetProduct)) == 5
+    assert len(sent(fake, commands.GetProduct)) == 5
 
 
 def test_a_download_that_fails_leaves_what_was_there(
@@ -393,9 +398,9 @@ def test_a_download_that_fails_leaves_what_was_there(
     (tmp_path / "direct.tiff").write_bytes(b"old")
     run = rig.submit(Checkerboard())
 
-    def vanish(request: m.Request) -> None:
+    def vanish(request: Request) -> None:
         command = request.command
-        if isinstance(command, m.GetProduct) and command.offset == 0:
+        if isinstance(command, commands.GetProduct) and command.offset == 0:
             fake.files["direct.tiff"] = bytes(8 << 20)  # shorter than it said
 
     fake.on_request = vanish
@@ -429,7 +434,7 @@ def test_the_endpoint_is_the_given_one_then_the_environments_then_the_default(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("UMBRA_RIG", raising=False)
-    assert chosen_endpoint(None) == m.DEFAULT_COMMAND
+    assert chosen_endpoint(None) == DEFAULT_COMMAND
     monkeypatch.setenv("UMBRA_RIG", "tcp://bench:5750")
     assert chosen_endpoint(None) == "tcp://bench:5750"
     assert chosen_endpoint("ipc:///run/umbra") == "ipc:///run/umbra"
@@ -463,12 +468,12 @@ def test_what_is_on_this_machine(endpoint: str, local: bool) -> None:
     ],
 )
 def test_where_events_are(told: str, reached: str, events: str) -> None:
-    welcome = m.Welcome(
+    welcome = replies.Welcome(
         protocol=1,
         server="",
         rig="",
         epoch="",
-        role=m.Role.OBSERVER,
+        role=Role.OBSERVER,
         events=told,
         methods=(),
         devices=(),

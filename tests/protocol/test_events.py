@@ -12,17 +12,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import protocol.aio
+import protocol.aio_run
 import protocol.run
-from protocol import messages as m
 from protocol.aio import AsyncClient
 from protocol.client import Client
 from protocol.connection import EVENTS_HWM, PREVIEWS_HWM
 from protocol.errors import Code, UmbraError
 from protocol.following import Following
-from protocol.messages import RunState
+from protocol.messages import commands
+from protocol.messages.envelopes import Event
+from protocol.messages.events import PreviewTaken, Progressed, QueueChanged, RigChanged
+from protocol.messages.rig import RigState
+from protocol.messages.runs import End, Product, Progress, RunInfo, RunState
 from protocol.run import Run
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 from tests.protocol.fake import UTC, FakeRig
 
 NEVER_S = 1000.0
@@ -37,19 +40,19 @@ def rig(fake: FakeRig) -> Iterator[Client]:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only an event can make a follower ask."""
-    for module in (protocol.run, protocol.aio):
+    for module in (protocol.run, protocol.aio_run):
         monkeypatch.setattr(module, "SILENCE_S", NEVER_S)
 
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A follower asks all the time."""
-    for module in (protocol.run, protocol.aio):
+    for module in (protocol.run, protocol.aio_run):
         monkeypatch.setattr(module, "SILENCE_S", 0.02)
 
 
-def progressed(run: str, recorded: int) -> m.Progressed:
-    progress = m.Progress(
+def progressed(run: str, recorded: int) -> Progressed:
+    progress = Progress(
         run=run,
         state=RunState.RUNNING,
         recorded=recorded,
@@ -62,11 +65,11 @@ def progressed(run: str, recorded: int) -> m.Progressed:
         phase="exposing",
         summary={"coverage": 0.5},
     )
-    return m.Progressed(progress=progress)
+    return Progressed(progress=progress)
 
 
-def ended(state: RunState, reason: str = "", code: str = "") -> m.End:
-    return m.End(state=state, reason=reason, code=code)
+def ended(state: RunState, reason: str = "", code: str = "") -> End:
+    return End(state=state, reason=reason, code=code)
 
 
 # ---------------------------------------------------------------- streams
@@ -75,18 +78,18 @@ def ended(state: RunState, reason: str = "", code: str = "") -> m.End:
 def test_events_come_in_order_with_their_arrays(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe("queue", "preview") as events:
         fake.await_subscribers(2)
-        fake.publish(m.QueueChanged(queue=("a",)))
-        fake.publish(m.RigChanged(state=m.RigState.MANUAL))  # not subscribed to
-        fake.publish(m.QueueChanged(queue=("a", "b")))
+        fake.publish(QueueChanged(queue=("a",)))
+        fake.publish(RigChanged(state=RigState.MANUAL))  # not subscribed to
+        fake.publish(QueueChanged(queue=("a", "b")))
         first, second = next(events), next(events)
         assert (first.body, second.body) == (
-            m.QueueChanged(queue=("a",)),
-            m.QueueChanged(queue=("a", "b")),
+            QueueChanged(queue=("a",)),
+            QueueChanged(queue=("a", "b")),
         )
         assert not first.gap
         assert not second.gap
         picture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
-        fake.publish(m.PreviewTaken(run="", what="frame"), {"preview": picture})
+        fake.publish(PreviewTaken(run="", what="frame"), {"preview": picture})
         assert np.array_equal(next(events).arrays["preview"], picture)
         assert events.next(timeout_s=0.01) is None
     assert list(events) == []  # closed
@@ -95,28 +98,28 @@ def test_events_come_in_order_with_their_arrays(fake: FakeRig, rig: Client) -> N
 def test_no_topic_is_all_but_previews(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe() as events:
         fake.await_subscribers(5)
-        fake.publish(m.PreviewTaken(run="", what="frame"))
-        fake.publish(m.RigChanged(state=m.RigState.MANUAL))
+        fake.publish(PreviewTaken(run="", what="frame"))
+        fake.publish(RigChanged(state=RigState.MANUAL))
         assert next(events).event.topic == "rig"
 
 
 def test_a_lost_event_shows_as_a_gap(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe("queue") as events:
         fake.await_subscribers(1)
-        fake.publish(m.QueueChanged(queue=()))
-        fake.publish(m.QueueChanged(queue=("lost",)), lose=True)
-        fake.publish(m.QueueChanged(queue=("a",)))
-        fake.publish(m.QueueChanged(queue=("b",)))
+        fake.publish(QueueChanged(queue=()))
+        fake.publish(QueueChanged(queue=("lost",)), lose=True)
+        fake.publish(QueueChanged(queue=("a",)))
+        fake.publish(QueueChanged(queue=("b",)))
         assert [next(events).gap for _ in range(3)] == [False, True, False]
 
 
 def test_a_new_epoch_is_a_gap(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe("queue") as events:
         fake.await_subscribers(1)
-        fake.publish(m.QueueChanged(queue=()))
+        fake.publish(QueueChanged(queue=()))
         fake.order(fake.new_epoch)
-        fake.publish(m.QueueChanged(queue=()))
-        fake.publish(m.QueueChanged(queue=()))
+        fake.publish(QueueChanged(queue=()))
+        fake.publish(QueueChanged(queue=()))
         assert [next(events).gap for _ in range(3)] == [False, True, False]
 
 
@@ -125,8 +128,8 @@ def test_garbled_events_are_passed_over(fake: FakeRig, rig: Client) -> None:
         fake.await_subscribers(1)
         for garbage in ([b"queue"], [b"queue", b""], [b"queue", b"{}"], [b"queue", b"\xff", b"x"]):
             fake.publish_raw(*garbage)
-        fake.publish(m.QueueChanged(queue=("a",)))
-        assert next(events).body == m.QueueChanged(queue=("a",))
+        fake.publish(QueueChanged(queue=("a",)))
+        assert next(events).body == QueueChanged(queue=("a",))
 
 
 def test_a_slow_reader_gets_the_newest_preview_and_no_pile(fake: FakeRig, rig: Client) -> None:
@@ -134,13 +137,13 @@ def test_a_slow_reader_gets_the_newest_preview_and_no_pile(fake: FakeRig, rig: C
         fake.await_subscribers(2)
         shown = [np.full((2, 2, 3), i, np.uint8) for i in range(PREVIEWS_HWM)]
         for picture in shown:
-            fake.publish(m.PreviewTaken(run="r", what="frame"), {"preview": picture})
-        fake.publish(m.PreviewTaken(run="r", what="direct"), {"preview": shown[0]})
-        fake.publish(m.QueueChanged(queue=("last",)))
+            fake.publish(PreviewTaken(run="r", what="frame"), {"preview": picture})
+        fake.publish(PreviewTaken(run="r", what="direct"), {"preview": shown[0]})
+        fake.publish(QueueChanged(queue=("last",)))
         got: list[tuple[str, int]] = []
         while (notice := next(events)).event.topic == "preview":  # states never wait behind
             body = notice.body
-            assert isinstance(body, m.PreviewTaken)
+            assert isinstance(body, PreviewTaken)
             got.append((body.what, int(notice.arrays["preview"].max())))
         assert len(got) <= 3
         assert events._sockets[1].rcvhwm == PREVIEWS_HWM
@@ -154,8 +157,8 @@ def test_drained_previews_are_conflated() -> None:
     from protocol.connection import Inbox
 
     def message(sequence: int, what: str) -> list[zmq.Frame]:
-        body = m.PreviewTaken(run="r", what=what)
-        event = m.Event(topic="preview", sequence=sequence, epoch="e", utc=UTC, body=body)
+        body = PreviewTaken(run="r", what=what)
+        event = Event(topic="preview", sequence=sequence, epoch="e", utc=UTC, body=body)
         return [zmq.Frame(b"preview"), zmq.Frame(msgspec.json.encode(event))]
 
     notices = Inbox().take(
@@ -221,7 +224,7 @@ def test_silence_is_mended_by_a_snapshot(fake: FakeRig, rig: Client) -> None:
 def test_a_rig_that_vanishes_is_noticed() -> None:
     with contextlib.ExitStack() as stack:
         fake = stack.enter_context(FakeRig())
-        with Client(fake.endpoint, timeout_s=0.3) as rig:
+        with Client(fake.endpoint, timeout_s=1.5) as rig:
             progress = rig.scan(Checkerboard()).progress()
             next(progress)
             stack.close()
@@ -260,23 +263,23 @@ def test_ctrl_c_ends_the_following_and_the_client_goes_on(fake: FakeRig, rig: Cl
     assert [p.state for p in _two(run.progress())] == [RunState.QUEUED]
 
 
-def _two(progress: Iterator[m.Progress]) -> Iterator[m.Progress]:
+def _two(progress: Iterator[Progress]) -> Iterator[Progress]:
     """The first, and then away from it: the stream must be closed behind us."""
     yield next(progress)
 
 
 def test_events_that_the_snapshot_holds_are_passed_over() -> None:
     following = Following("r")
-    info = m.RunInfo(id="r", state=RunState.RUNNING, spec=Checkerboard(), submitted=UTC, recorded=5)
+    info = RunInfo(id="r", state=RunState.RUNNING, spec=Checkerboard(), submitted=UTC, recorded=5)
     with FakeRig() as fake:
         fake.sequences = {"progress": 7}
         status = fake._status()
     assert following.snapshot(status, info) is not None
     assert following.snapshot(status, info) is None  # no news
 
-    def event(sequence: int, recorded: int) -> m.Event:
+    def event(sequence: int, recorded: int) -> Event:
         body = progressed("r", recorded)
-        return m.Event(topic="progress", sequence=sequence, epoch=status.epoch, utc=UTC, body=body)
+        return Event(topic="progress", sequence=sequence, epoch=status.epoch, utc=UTC, body=body)
 
     assert not following.outdated_by(event(7, 4))
     assert following.event(event(7, 4)) is None
@@ -297,7 +300,7 @@ def test_events_that_the_snapshot_holds_are_passed_over() -> None:
     ],
 )
 def test_a_run_that_ends_badly_raises_its_reason(
-    fake: FakeRig, rig: Client, end: m.End, code: Code
+    fake: FakeRig, rig: Client, end: End, code: Code
 ) -> None:
     run = rig.scan(Checkerboard())
     fake.change(run.id, state=end.state, end=end)
@@ -333,7 +336,7 @@ def test_a_run_in_hand(fake: FakeRig, rig: Client, tmp_path: Path) -> None:
     assert rig.run().id == run.id
     files = {"direct.tiff": b"d", "results/2/direct.tiff": b"d2", "report.html": b"<p>"}
     fake.files |= files
-    products = tuple(m.Product(name=f, kind="image", file=f) for f in files)
+    products = tuple(Product(name=f, kind="image", file=f) for f in files)
     fake.change(run.id, products=products)
     run.save(tmp_path / "out")
     found = {str(p.relative_to(tmp_path / "out")): p for p in (tmp_path / "out").rglob("*.*")}
@@ -345,7 +348,7 @@ def test_a_product_stays_in_its_folder(
     fake: FakeRig, rig: Client, tmp_path: Path, file: str
 ) -> None:
     run = rig.scan(Checkerboard())
-    fake.change(run.id, products=(m.Product(name="direct", kind="image", file=file),))
+    fake.change(run.id, products=(Product(name="direct", kind="image", file=file),))
     with pytest.raises(UmbraError, match="names no file"):
         run.save(tmp_path)
 
@@ -371,7 +374,7 @@ async def test_the_asyncio_client_follows_a_run(
         assert (await run.result()).final
         fake.files["direct.tiff"] = b"abc"
         fake.change(
-            run.id, products=(m.Product(name="direct.tiff", kind="image", file="direct.tiff"),)
+            run.id, products=(Product(name="direct.tiff", kind="image", file="direct.tiff"),)
         )
         [path] = await run.save(tmp_path)
         assert path.read_bytes() == b"abc"
@@ -389,17 +392,17 @@ async def test_the_asyncio_client_follows_a_run(
 async def test_the_asyncio_client_streams_events(fake: FakeRig) -> None:
     async with AsyncClient(fake.endpoint) as rig, rig.subscribe("queue", "preview") as events:
         fake.await_subscribers(2)
-        fake.publish(m.QueueChanged(queue=("a",)))
-        fake.publish(m.QueueChanged(queue=()), lose=True)
-        fake.publish(m.QueueChanged(queue=("b",)))
+        fake.publish(QueueChanged(queue=("a",)))
+        fake.publish(QueueChanged(queue=()), lose=True)
+        fake.publish(QueueChanged(queue=("b",)))
         got = []
         async for notice in events:
             got.append((notice.body, notice.gap))
             if len(got) == 2:
                 break
         assert got == [
-            (m.QueueChanged(queue=("a",)), False),
-            (m.QueueChanged(queue=("b",)), True),
+            (QueueChanged(queue=("a",)), False),
+            (QueueChanged(queue=("b",)), True),
         ]
         assert await events.next(0.01) is None
 
@@ -415,7 +418,7 @@ def test_a_lock_is_kept_alive_and_given_back(fake: FakeRig, rig: Client) -> None
         rig.snap()
     assert fake.lock is None
     assert rig.token == ""
-    assert {r.token for r in fake.requests if isinstance(r.command, m.Snap)} == {token}
+    assert {r.token for r in fake.requests if isinstance(r.command, commands.Snap)} == {token}
     assert "umbra lock" not in {t.name for t in threading.enumerate()}
 
 

@@ -15,7 +15,7 @@ from protocol import keys
 from protocol.client import Client
 from protocol.errors import Code, UmbraError
 from protocol.keys import AllowList, ClientKeys, KeyPair
-from protocol.messages import Role
+from protocol.messages.access import Role
 from tests.protocol.fake import FakeRig
 
 Connect = Callable[..., Client]

@@ -10,7 +10,7 @@ import pytest
 from protocol import mesh as geometry
 from protocol.cli.app import run
 from protocol.mesh import Mesh
-from protocol.scans import SUN_DEG, Grid
+from protocol.scans.occluded import SUN_DEG, Grid
 
 SQUARE = Mesh(6.25, 10.0)
 

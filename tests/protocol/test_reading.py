@@ -10,17 +10,12 @@ import pytest
 from protocol.cli.reprocess import OPTIONS
 from protocol.errors import Code, UmbraError
 from protocol.reading import EXPOSED, READ, changeable, changed, fields
-from protocol.scans import (
-    AnyCalibration,
-    AnyScan,
-    CalibrateLeak,
-    Checkerboard,
-    Mesh,
-    Point,
-    Radiometry,
-    SingleImage,
-    VerifyPatchSize,
-)
+from protocol.scans.anyscan import AnyCalibration, AnyScan
+from protocol.scans.calibrations import CalibrateLeak
+from protocol.scans.occluded import Mesh
+from protocol.scans.projected import Checkerboard, SingleImage
+from protocol.scans.spec import Radiometry
+from protocol.scans.verifications import Point, VerifyPatchSize
 
 METHODS: tuple[Any, ...] = get_args(AnyScan)
 

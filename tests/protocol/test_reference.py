@@ -12,11 +12,13 @@ from typing import get_args
 import msgspec
 import pytest
 
-from protocol import messages as m
 from protocol import reference
 from protocol.errors import Code, ErrorInfo
-from protocol.messages import RunState
-from protocol.scans import AnyScan
+from protocol.messages import commands, replies
+from protocol.messages.envelopes import Request
+from protocol.messages.events import AnyEvent
+from protocol.messages.runs import RunState
+from protocol.scans.anyscan import AnyScan
 from tests.protocol.fake import FakeRig
 
 DOCS = Path(__file__).parents[2] / "docs" / "protocol.md"
@@ -26,8 +28,8 @@ DOCS = Path(__file__).parents[2] / "docs" / "protocol.md"
 def endpoint(fake: FakeRig) -> str:
     """The rig that the thirty lines are run against; here its run is done when next asked for."""
 
-    def finish(request: m.Request) -> None:
-        if isinstance(request.command, m.Submit):
+    def finish(request: Request) -> None:
+        if isinstance(request.command, commands.Submit):
             [run] = fake.runs
             fake.runs[run] = msgspec.structs.replace(fake.runs[run], state=RunState.DONE)
 
@@ -48,7 +50,7 @@ def test_the_page_is_current() -> None:
 
 def test_everything_is_on_the_page() -> None:
     page = reference.page()
-    for union in (m.AnyCommand, m.AnyReply, m.AnyEvent, AnyScan):
+    for union in (commands.AnyCommand, replies.AnyReply, AnyEvent, AnyScan):
         for cls in get_args(union):
             assert f"### {cls.__name__}: `{cls.__struct_config__.tag}`" in page
     for code in Code:
@@ -105,6 +107,6 @@ def test_the_client_says_what_the_rig_says(fake: FakeRig, tmp_path: Path) -> Non
     ran = run(code.replace("wait_ms=5000", "wait_ms=100"), fake.endpoint, tmp_path)
     assert ran.returncode == 1
     assert ran.stderr == "the rig has no projector\n"
-    hellos = [r for r in fake.requests if isinstance(r.command, m.Hello)]
+    hellos = [r for r in fake.requests if isinstance(r.command, commands.Hello)]
     assert len(hellos) == 2
     assert len({r.id for r in hellos}) == 1

@@ -11,10 +11,16 @@ from pathlib import Path
 
 import umbra
 from protocol.errors import UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
+from tests.system import warm
 
 READY_S = 60.0
 ANSWER_S = 30.0
+SLOW, FAST = 0.25, 20.0
+"""Time scales: for a run that must go on until something happens to it, however late that comes on
+a busy machine; and for one whose end is waited for."""
+
+ENDLESS = umbra.Checkerboard(average=500)
 
 FAST_RIG = """
 [rig]
@@ -41,14 +47,18 @@ height = 120
 
 
 class Daemon:
-    """One `umbrad` process after the other, with one configuration and one data folder."""
+    """One `umbrad` process after the other, with one configuration and one data folder.
+
+    It starts warm (see tests.system.warm) unless it is `cold`: a new interpreter.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.data = folder / "data"
         self.endpoint = f"ipc://{folder}/c"
         self.config = folder / "rig.toml"
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[bytes] | warm.Process | None = None
+        self.cold = False
 
     def configure(
         self, *, camera: str = "", projector: str = "", more: str = "", scale: float = 4
@@ -69,14 +79,26 @@ class Daemon:
         self.launch(*options)
         return self.connect()
 
-    def launch(self, *options: str, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[bytes]:
-        environment = {k: v for k, v in os.environ.items() if k != "NOTIFY_SOCKET"}
+    def launch(self, *options: str) -> subprocess.Popen[bytes] | warm.Process:
+        if self.cold:
+            return self.launch_cold(*options)
+        with (self.folder / "log").open("ab") as log:
+            self.process = warm.Process(
+                ["--config", str(self.config), *options],
+                stderr=log.fileno(),
+                environment=_environment(),
+            )
+        return self.process
+
+    def launch_cold(
+        self, *options: str, stdin: int = subprocess.DEVNULL
+    ) -> subprocess.Popen[bytes]:
         with (self.folder / "log").open("ab") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "daemon.app", "--config", str(self.config), *options],
                 stdin=stdin,
                 stderr=log,
-                env=environment,
+                env=_environment(),
             )
         return self.process
 
@@ -109,15 +131,18 @@ class Daemon:
     def close(self) -> None:
         if self.process is not None and self.process.poll() is None:
             self.kill()
-        if self.process is not None and self.process.stdin is not None:
-            self.process.stdin.close()
+
+
+def _environment() -> dict[str, str]:
+    return {k: v for k, v in os.environ.items() if k != "NOTIFY_SOCKET"}
 
 
 def until(true: Callable[[], bool], seconds: float = 90.0) -> None:
-    """Ask again and again until something is true; the wait is the question's own round trip."""
+    """Ask again and again until something is true, and leave the daemon time to come to it."""
     deadline = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < deadline, "it did not come true in time"
+        time.sleep(0.01)
 
 
 def recorded(rig: umbra.Client, run: str, frames: int) -> None:

@@ -11,7 +11,7 @@ import pytest
 import umbra
 from protocol import keys, reference
 from protocol.errors import Code, UmbraError
-from protocol.messages import Role
+from protocol.messages.access import Role
 from tests.system.harness import Daemon
 
 pytestmark = pytest.mark.system

@@ -13,14 +13,16 @@ import pytest
 from numpy.typing import NDArray
 
 import umbra
-from daemon.frames import FrameStore
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
 from daemon.separation.estimator import Components
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from daemon.storage.frames import FrameStore
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunState
-from tests.system.harness import Daemon, recorded, until
+from protocol.messages.runs import RunState
+from tests.system.harness import FAST, Daemon, recorded, until
 from tests.system.test_command_line import checker, scene
 from tests.system.test_command_line import umbra as run_umbra
 
@@ -69,20 +71,22 @@ def over_the_same_frames(daemon: Daemon, run: str) -> Components:
     return components
 
 
-LONG = umbra.TwoImage(exposure_us=LONG_US, bracket=BRACKET, average=10)
+LONG = umbra.TwoImage(exposure_us=LONG_US, bracket=BRACKET, average=3)
 
 
 def test_a_killed_run_resumes_within_a_bracket_to_the_same_bits(daemon: Daemon) -> None:
+    daemon.configure(scale=1)
     with daemon.start() as rig:
         run = rig.scan(LONG).id
-        recorded(rig, run, 30)
+        recorded(rig, run, 10)  # of 2.8 s
         daemon.kill()
+    daemon.configure(scale=FAST)
     with daemon.start() as rig:
         rig.camera(exposure_us=5_000.0)  # what the run goes on with is its own
         rig.resume(run)
         info = rig.run(run).wait(90)
         assert info.state is RunState.DONE
-        assert info.recorded == info.planned == 120
+        assert info.recorded == info.planned == 36
         result = rig.run(run).result()
         expected = over_the_same_frames(daemon, run)
     assert np.array_equal(result.direct, expected.direct, equal_nan=True)

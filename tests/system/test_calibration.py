@@ -8,7 +8,7 @@ import pytest
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon
 
 pytestmark = pytest.mark.system

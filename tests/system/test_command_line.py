@@ -8,7 +8,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +27,15 @@ PRODUCTS = ["direct.tiff", "global.tiff", "preview.png", "quality.json", "qualit
 SIZE = (48, 64)
 UMBRA = [sys.executable, "-m", "protocol.cli"]
 
-Folder = Callable[[], Path]
-
 
 @pytest.fixture(autouse=True)
-def _own_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    temporary = tmp_path / "tmp"
-    temporary.mkdir()
-    monkeypatch.setenv("TMPDIR", str(temporary))
+def _own_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Where temporary files go: a short path, for a private daemon's sockets are in there."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))  # of a daemon with no data folder
     monkeypatch.delenv("UMBRA_RIG", raising=False)
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        monkeypatch.setenv("TMPDIR", folder)
+        yield
 
 
 def umbra(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -84,9 +84,9 @@ def read(path: Path) -> NDArray[Any]:
     return image[..., ::-1]
 
 
-def daemons(tmp_path: Path) -> list[str]:
-    """The command lines of private daemons that work in this test's folder."""
-    mark = str(tmp_path).encode()
+def daemons() -> list[str]:
+    """The command lines of private daemons that work in this test's temporary folder."""
+    mark = os.environ["TMPDIR"].encode()
     found = []
     for entry in Path("/proc").glob("[0-9]*/cmdline"):
         try:
@@ -101,8 +101,8 @@ def daemons(tmp_path: Path) -> list[str]:
 def assert_no_orphan(tmp_path: Path) -> None:
     """Neither a process nor a file of a private daemon is left, here or in the user's state."""
     assert not (tmp_path / "state").exists()
-    assert not daemons(tmp_path)
-    assert not list((tmp_path / "tmp").glob("umbra-*"))
+    assert not daemons()
+    assert not list(Path(os.environ["TMPDIR"]).glob("umbra-*"))
 
 
 def test_demo(tmp_path: Path) -> None:
@@ -123,7 +123,10 @@ def test_demo(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [*UMBRA, "demo", "-o", "out"], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+        [*UMBRA, "demo", "-o", "out", "--speed", "0.2"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert process.stderr is not None
     for line in process.stderr:
@@ -131,7 +134,7 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
             break
     else:
         pytest.fail("the demo ended before it ran")
-    assert daemons(tmp_path)
+    assert daemons()
     process.send_signal(number)
     said = process.stderr.read()
     process.stderr.close()
@@ -146,9 +149,9 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
         assert_no_orphan(tmp_path)
     else:  # its folder cannot be cleared away by the dead; the daemon goes all the same
         assert code == -signal.SIGKILL
-        (folder,) = (tmp_path / "tmp").glob("umbra-*")
+        (folder,) = Path(os.environ["TMPDIR"]).glob("umbra-*")
         until(lambda: not _listens(folder / "command"))
-        until(lambda: not daemons(tmp_path))
+        until(lambda: not daemons())
         shutil.rmtree(folder)
     assert not (tmp_path / "out").exists()
 
@@ -291,3 +294,31 @@ def test_a_stray_module_in_the_users_folder_does_no_harm(tmp_path: Path) -> None
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_photographs_of_exported_patterns_are_separated_by_the_command_that_is_told(
+    tmp_path: Path,
+) -> None:
+    size = f"{SIZE[1]}x{SIZE[0]}"
+    options = ("-m", "sinusoid", "--phases", "4", "--periods", "8", "--size", size)
+    done = umbra("patterns", *options, "--json", "-o", "patterns", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    direct, smooth = scene()
+    (tmp_path / "photos").mkdir()
+    taken = {"black.png": tmp_path / "black.png", "white.png": tmp_path / "white.png"}
+    for file in map(Path, told["files"]):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert image is not None
+        levels = image[..., None] / 255.0
+        seen = direct * levels + smooth * levels.mean()
+        photograph = taken.get(file.name, tmp_path / "photos" / file.name)
+        cv2.imwrite(str(photograph), np.rint(16 * seen[..., ::-1]).astype(np.uint16))
+    named = {"PHOTOS": "photos", "BLACK": "black.png", "WHITE": "white.png", "OUT": "out"}
+    words = [named.get(word, word) for word in told["command"].split()]
+    done = umbra(*words[1:], "--depth", "12", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = read(tmp_path / "out" / "direct.tiff")
+    np.testing.assert_allclose(found, 16 * direct, atol=20)
+    assert json.loads((tmp_path / "out" / "quality.json").read_text())["full_scale"] == 4095
+    assert_no_orphan(tmp_path)

@@ -10,16 +10,17 @@ from pathlib import Path
 
 import pytest
 
-import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import Health, Search
-from tests.system.harness import Daemon, recorded, until
+from protocol.messages.findings import Search
+from protocol.messages.rig import Health
+from tests.system.harness import ENDLESS, Daemon, recorded, until
 
 pytestmark = pytest.mark.system
 
 DRIVERS = """
 import os, threading
-from drivers.base import DeviceRefused, Options
+from drivers.base.errors import DeviceRefused
+from drivers.base.device import Options
 from drivers.virtual.camera import VirtualCamera
 
 class Needy(Options, frozen=True, kw_only=True):
@@ -73,6 +74,7 @@ def drivers(daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         "\n".join(["[umbra.drivers]", *points, missing, ""])
     )
     monkeypatch.setenv("PYTHONPATH", str(package))
+    daemon.cold = True  # Python reads that as it starts
     text = daemon.config.read_text()
     text = text.replace(
         '[camera]\ndriver = "virtual"', '[camera]\ndriver = "mine"\nserial = "mine-1"'
@@ -111,7 +113,7 @@ def test_what_is_attached_and_who_could_not_look(drivers: Daemon) -> None:
 
 def test_refused_while_a_run_uses_the_devices(daemon: Daemon) -> None:
     with daemon.start() as rig:
-        run = rig.scan(umbra.Checkerboard(average=20))
+        run = rig.scan(ENDLESS)
         recorded(rig, run.id, 2)
         with pytest.raises(UmbraError, match=run.id) as caught:
             rig.discover("grbl")

@@ -8,7 +8,7 @@ import pytest
 
 import umbra
 from protocol.errors import UmbraError
-from protocol.messages import Health
+from protocol.messages.rig import Health
 from tests.drivers.xserver import xvfb
 from tests.system.harness import Daemon, until
 

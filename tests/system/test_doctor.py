@@ -10,8 +10,9 @@ import pytest
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import Check, Outcome, RigState
-from tests.system.harness import Daemon, recorded
+from protocol.messages.findings import Check, Outcome
+from protocol.messages.rig import RigState
+from tests.system.harness import ENDLESS, Daemon, recorded
 
 pytestmark = pytest.mark.system
 
@@ -58,7 +59,7 @@ def test_a_camera_that_hears_no_trigger(daemon: Daemon) -> None:
 
 
 def test_a_wire_that_loses_a_pulse(daemon: Daemon) -> None:
-    daemon.configure(camera='faults = ["drop-trigger@9"]\nexposure_us = 10000', scale=1)
+    daemon.configure(camera='faults = ["drop-trigger:pulse@2"]\nexposure_us = 10000', scale=1)
     with daemon.start() as rig:
         found = {c.name: c for c in rig.examine()}
         assert found["camera: trigger"].outcome is Outcome.OK
@@ -76,7 +77,7 @@ def test_a_rig_in_the_dark(daemon: Daemon) -> None:
 
 def test_only_passive_while_a_run_goes_on(daemon: Daemon) -> None:
     with daemon.start() as rig:
-        run = rig.scan(umbra.Checkerboard(average=20))
+        run = rig.scan(ENDLESS)
         recorded(rig, run.id, 2)
         with pytest.raises(UmbraError, match=run.id) as caught:
             rig.examine()

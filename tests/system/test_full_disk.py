@@ -10,15 +10,16 @@ from pathlib import Path
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from protocol.errors import Code, UmbraError
-from protocol.messages import RigState, RunState
+from protocol.messages.rig import RigState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system
 
-LONG = umbra.Checkerboard(average=6)
-FRAMES = 27 * 6
+SPEC = umbra.Checkerboard(average=2)
+FRAMES = 27 * 2
 
 
 @pytest.fixture
@@ -28,6 +29,7 @@ def tiny(daemon: Daemon) -> Iterator[Path]:
     mounting = ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(daemon.data)]
     if os.geteuid() != 0 or subprocess.run(mounting, capture_output=True, check=False).returncode:
         pytest.skip("mounting a tmpfs needs root")
+    daemon.configure(scale=0.5)
     text = daemon.config.read_text().replace("reserve_mb = 1", "reserve_mb = 0")
     daemon.config.write_text(text + "[sequencer]\nring_frames = 4\n")
     yield daemon.data
@@ -49,8 +51,8 @@ def fill(data: Path) -> None:
 
 def test_a_disk_that_fills_pauses_the_run_and_no_frame_is_lost(daemon: Daemon, tiny: Path) -> None:
     with daemon.start() as rig:
-        run = rig.scan(LONG)
-        recorded(rig, run.id, 10)
+        run = rig.scan(SPEC)
+        recorded(rig, run.id, 5)
         fill(tiny)
         until(lambda: rig.status().state is RigState.PAUSED)
         progress = rig.status().progress
@@ -74,8 +76,8 @@ def test_a_disk_that_fills_pauses_the_run_and_no_frame_is_lost(daemon: Daemon, t
 
 def test_a_run_that_waits_for_room_can_be_aborted(daemon: Daemon, tiny: Path) -> None:
     with daemon.start() as rig:
-        run = rig.scan(LONG)
-        recorded(rig, run.id, 10)
+        run = rig.scan(SPEC)
+        recorded(rig, run.id, 5)
         fill(tiny)
         until(lambda: rig.status().state is RigState.PAUSED)
         rig.abort(run.id)

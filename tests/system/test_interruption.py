@@ -8,18 +8,20 @@ import numpy as np
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
 from daemon.separation.estimator import Components
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from daemon.storage.frames import FrameStore
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunState
-from tests.system.harness import Daemon, recorded, until
+from protocol.messages.runs import RunState
+from tests.system.harness import ENDLESS, FAST, SLOW, Daemon, recorded, until
 
 pytestmark = pytest.mark.system
 
-LONG = umbra.Checkerboard(average=8)
+SPEC = umbra.Checkerboard(average=2)
 
 
 def over_the_same_frames(daemon: Daemon, run: str) -> tuple[np.ndarray, np.ndarray]:
@@ -28,7 +30,7 @@ def over_the_same_frames(daemon: Daemon, run: str) -> tuple[np.ndarray, np.ndarr
         CameraInfo(160, 120, PixelFormat.BAYER_RG12, black_level=63.0),
         ProjectorInfo(128, 96, 60.0),
     )
-    estimator = method_for(LONG, bench).estimator()
+    estimator = method_for(SPEC, bench).estimator()
     frames = FrameStore.open(daemon.data / "runs" / run, readonly=True)
     for record in frames.records():
         estimator.update(frames.read(record.index), record.observation)
@@ -38,17 +40,19 @@ def over_the_same_frames(daemon: Daemon, run: str) -> tuple[np.ndarray, np.ndarr
 
 
 def test_a_killed_run_is_interrupted_and_resumes_to_the_same_bits(daemon: Daemon) -> None:
+    daemon.configure(scale=SLOW)
     with daemon.start() as rig:
-        run = rig.scan(LONG).id
-        recorded(rig, run, 30)
+        run = rig.scan(SPEC).id
+        recorded(rig, run, 8)
         daemon.kill()
+    daemon.configure(scale=FAST)
     with daemon.start() as rig:
         info = rig.run(run).refresh()
         assert info.state is RunState.INTERRUPTED
         assert info.end is not None
         assert "umbra resume" in info.end.reason
         kept = len(FrameStore.open(daemon.data / "runs" / run, readonly=True))
-        assert kept >= 30  # what was acknowledged is there
+        assert kept >= 8  # what was acknowledged is there
         rig.resume(run)
         info = rig.run(run).wait(60)
         assert info.state is RunState.DONE
@@ -60,13 +64,15 @@ def test_a_killed_run_is_interrupted_and_resumes_to_the_same_bits(daemon: Daemon
 
 
 def test_sigterm_in_the_middle_is_a_clean_stop(daemon: Daemon) -> None:
+    daemon.configure(scale=SLOW)
     with daemon.start() as rig:
-        run = rig.scan(LONG).id
-        recorded(rig, run, 10)
+        run = rig.scan(SPEC).id
+        recorded(rig, run, 3)
         assert daemon.stop() == 0
     file = json.loads((daemon.data / "runs" / run / "run.json").read_text())
     assert file["state"] == "interrupted"
     assert file["recorded"] == len(FrameStore.open(daemon.data / "runs" / run, readonly=True))
+    daemon.configure(scale=FAST)
     with daemon.start() as rig:
         rig.resume(run)
         assert rig.run(run).wait(60).state is RunState.DONE
@@ -74,7 +80,7 @@ def test_sigterm_in_the_middle_is_a_clean_stop(daemon: Daemon) -> None:
 
 def test_the_queue_survives_in_its_order(daemon: Daemon) -> None:
     with daemon.start() as rig:
-        first = rig.scan(LONG).id
+        first = rig.scan(ENDLESS).id
         waiting = [rig.scan(umbra.TwoImage()).id for _ in range(3)]
         rig.move_queued(waiting[2], 0)
         recorded(rig, first, 1)
@@ -89,7 +95,7 @@ def test_the_queue_survives_in_its_order(daemon: Daemon) -> None:
 
 
 def test_a_submission_repeated_after_a_restart_is_the_same_run(daemon: Daemon) -> None:
-    from daemon.store import Store  # the request id is the daemon's own
+    from daemon.storage.store import Store  # the request id is the daemon's own
 
     with daemon.start() as rig:
         run = rig.scan(umbra.TwoImage())
@@ -104,8 +110,8 @@ def test_a_submission_repeated_after_a_restart_is_the_same_run(daemon: Daemon) -
 
 def test_a_resume_needs_the_same_devices(daemon: Daemon) -> None:
     with daemon.start() as rig:
-        run = rig.scan(LONG).id
-        recorded(rig, run, 10)
+        run = rig.scan(ENDLESS).id
+        recorded(rig, run, 1)
         daemon.kill()
     daemon.configure(camera='serial = "another"')
     with daemon.start() as rig:

@@ -16,8 +16,10 @@ import umbra
 from drivers.registry import UnknownDriver, load
 from protocol.client import EventStream
 from protocol.errors import Code, UmbraError
-from protocol.messages import PreviewTaken, RigChanged, RigState, RunState
-from protocol.scans import SingleImage
+from protocol.messages.events import PreviewTaken, RigChanged
+from protocol.messages.rig import RigState
+from protocol.messages.runs import RunState
+from protocol.scans.projected import SingleImage
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system

@@ -8,7 +8,7 @@ import pytest
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import RunInfo, RunState
+from protocol.messages.runs import RunInfo, RunState
 from protocol.run import Run
 from tests.system.harness import Daemon, recorded, until
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
 from daemon.separation.estimator import Components
-from protocol.messages import RunState, StageState
+from daemon.storage.frames import FrameStore
+from protocol.messages.rig import StageState
+from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system
@@ -120,7 +121,9 @@ def test_a_stage_that_vanishes_fails_the_run_and_must_be_homed_again(daemon: Dae
 def test_a_killed_mesh_scan_goes_on_to_the_same_bits(bench: Daemon) -> None:
     from daemon.scans.catalog import method_for
     from daemon.scans.method import Bench
-    from drivers.base import CameraInfo, PixelFormat, StageInfo
+    from drivers.base.camera import CameraInfo
+    from drivers.base.pixelformat import PixelFormat
+    from drivers.base.stage import StageInfo
 
     with bench.start() as rig:
         run = rig.scan(MESH).id

@@ -10,12 +10,11 @@ import zmq
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import Health, RigState, RunState
-from tests.system.harness import Daemon, recorded, until
+from protocol.messages.rig import Health, RigState
+from protocol.messages.runs import RunState
+from tests.system.harness import ENDLESS, FAST, SLOW, Daemon, recorded, until
 
 pytestmark = pytest.mark.system
-
-LONG = umbra.Checkerboard(average=20)
 
 
 def test_a_scan_from_command_to_components(daemon: Daemon) -> None:
@@ -34,9 +33,10 @@ def test_a_scan_from_command_to_components(daemon: Daemon) -> None:
 
 
 def test_a_second_client_while_a_scan_runs(daemon: Daemon) -> None:
+    daemon.configure(scale=1)
     with daemon.start() as rig, daemon.connect() as other:
-        run = rig.scan(LONG)
-        recorded(other, run.id, 85)  # black, white and two patterns
+        run = rig.scan(umbra.Checkerboard(average=10))
+        recorded(other, run.id, 42)  # black, white and two patterns
         status = other.status()
         assert status.state is RigState.SCANNING
         assert status.run is not None
@@ -66,7 +66,7 @@ def test_a_second_client_while_a_scan_runs(daemon: Daemon) -> None:
 
 def test_an_emergency_stop_holds_until_reset(daemon: Daemon) -> None:
     with daemon.start() as rig:
-        run = rig.scan(LONG)
+        run = rig.scan(ENDLESS)
         waiting = rig.scan(umbra.TwoImage())
         recorded(rig, run.id, 3)
         rig.estop()
@@ -229,7 +229,7 @@ def test_a_full_disk_is_said_before_the_scan(daemon: Daemon) -> None:
 
 
 def test_stopping_with_the_parent(daemon: Daemon) -> None:
-    process = daemon.launch("--until-eof", stdin=subprocess.PIPE)
+    process = daemon.launch_cold("--until-eof", stdin=subprocess.PIPE)
     with daemon.connect():
         assert process.stdin is not None
         process.stdin.close()
@@ -238,7 +238,7 @@ def test_stopping_with_the_parent(daemon: Daemon) -> None:
 
 def test_a_bad_configuration_exits_with_2(daemon: Daemon) -> None:
     daemon.config.write_text("[camera]\ndriver = 'virtual'\nwdth = 3\n")
-    assert daemon.launch().wait(60) == 2
+    assert daemon.launch_cold().wait(60) == 2
     assert daemon.log().strip() == f"umbrad: {daemon.config}: camera.wdth: there is no such key"
 
 
@@ -247,7 +247,7 @@ def test_an_emergency_stop_before_the_run_has_the_devices(daemon: Daemon) -> Non
     daemon.configure(projector='faults = ["timeout:safe@2"]')
     with daemon.start() as rig, daemon.connect() as other:
         rig.show(umbra.WHITE)
-        run = rig.scan(LONG)
+        run = rig.scan(ENDLESS)
         other.estop()
         info = run.wait(60, check=False)
         assert info.state is RunState.ABORTED
@@ -257,7 +257,7 @@ def test_an_emergency_stop_before_the_run_has_the_devices(daemon: Daemon) -> Non
 
 def test_an_emergency_stop_outlives_the_daemon(daemon: Daemon) -> None:
     with daemon.start() as rig:
-        waiting = rig.scan(LONG)
+        waiting = rig.scan(ENDLESS)
         queued = rig.scan(umbra.TwoImage())
         recorded(rig, waiting.id, 1)
         rig.estop()
@@ -279,10 +279,12 @@ def test_the_queue_waits_for_a_device_that_is_away(daemon: Daemon) -> None:
 
 
 def test_a_resumed_run_sets_the_camera_as_it_was(daemon: Daemon) -> None:
+    daemon.configure(scale=SLOW)
     with daemon.start() as rig:
-        run = rig.scan(LONG)
-        recorded(rig, run.id, 10)
+        run = rig.scan(umbra.Checkerboard(average=2))
+        recorded(rig, run.id, 5)
         daemon.kill()
+    daemon.configure(scale=FAST)
     with daemon.start() as rig:
         rig.camera(pixel_format="Mono12")
         rig.resume(run.id)

@@ -9,15 +9,18 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+import msgspec
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from protocol.errors import UmbraError
-from protocol.messages import RigState, RunState, Status
+from protocol.messages.replies import Status
+from protocol.messages.rig import RigState, StageState
+from protocol.messages.runs import RunState
 from protocol.run import Run
-from protocol.scans import Ready
-from tests.system.harness import Daemon, recorded, until
+from protocol.scans.spec import Ready
+from tests.system.harness import ENDLESS, FAST, SLOW, Daemon, recorded, until
 
 pytestmark = pytest.mark.system
 
@@ -132,14 +135,38 @@ def test_a_wait_can_be_aborted_and_survives_a_kill(daemon: Daemon) -> None:
         run = rig.scan(umbra.Mesh(**MESH, ready=ready)).id
         until(lambda: rig.run(run).refresh().state is RunState.WAITING)
         daemon.kill()
+    with daemon.start() as rig:  # it had lost nothing, and goes on waiting
+        until(lambda: rig.run(run).refresh().state is RunState.WAITING)
+        assert not rig.status().queue
+        assert daemon.stop() == 0
     with daemon.start() as rig:
-        assert rig.run(run).refresh().state is RunState.INTERRUPTED
-        rig.resume(run)
         until(lambda: rig.run(run).refresh().state is RunState.WAITING)
         rig.abort(run)
         # The next look is 150 s away: longer than this has patience.
         assert rig.run(run).wait(60, check=False).state is RunState.ABORTED
         until(lambda: rig.status().state is RigState.IDLE)
+
+
+def test_a_stage_in_alarm_is_waited_for_until_somebody_has_looked(daemon: Daemon) -> None:
+    garden(daemon, NIGHT)
+    text = daemon.config.read_text()
+    daemon.config.write_text(text.replace('light = "sun"\n', 'faults = ["no-switch@1"]\n'))
+    ready = Ready(deadline_s=86_400.0, light_min=0.3, look_s=600.0)
+    with daemon.start() as rig:
+        run = rig.scan(umbra.Mesh(**MESH, ready=ready)).id
+
+        def waits(what: str, seen: str) -> bool:
+            progress = rig.status().progress
+            found = progress and progress.waits
+            return bool(found and found.what == what and seen in found.seen)
+
+        until(lambda: waits("stage", "limit switch X was not found"))
+        with pytest.raises(UmbraError, match="is using the devices"):
+            rig.stage_home(30.0)
+        rig.stage_unlock()  # the next look is 150 s away, and comes at once
+        until(lambda: waits("light", "0.0%"))
+        assert rig.stage().state is StageState.IDLE
+        rig.abort(run)
 
 
 def test_a_device_that_is_away_is_waited_for(daemon: Daemon) -> None:
@@ -195,12 +222,13 @@ def test_a_scene_that_is_too_dark_is_told_and_scanned(daemon: Daemon) -> None:
 
 
 def test_an_interrupted_run_keeps_the_exposure_that_it_chose(daemon: Daemon) -> None:
-    spec = umbra.Checkerboard(average=4, auto_exposure=True)
-    daemon.configure(projector="refresh_hz = 500")
+    spec = umbra.Checkerboard(average=2, auto_exposure=True)
+    daemon.configure(projector="refresh_hz = 500", scale=SLOW)
     with daemon.start() as rig:
         run = rig.scan(spec).id
         recorded(rig, run, 5)
         daemon.kill()
+    daemon.configure(projector="refresh_hz = 500", scale=FAST)
     chosen = rig_of(daemon, run)["exposure"]
     with daemon.start() as rig:
         rig.camera(exposure_us=1000.0)
@@ -217,7 +245,7 @@ def test_a_run_leaves_the_camera_as_it_found_it(daemon: Daemon) -> None:
         before = rig.camera(exposure_us=12_000.0, gain=1.0)
         assert rig.scan(umbra.TwoImage(exposure_us=8000.0, gain=3.0)).wait(60)
         assert rig.camera() == before
-        run = rig.scan(umbra.Checkerboard(average=32, exposure_us=9000.0))
+        run = rig.scan(msgspec.structs.replace(ENDLESS, exposure_us=9000.0))
         recorded(rig, run.id, 3)
         rig.abort(run.id)
         assert run.wait(60, check=False).state is RunState.ABORTED

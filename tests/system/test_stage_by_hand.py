@@ -11,9 +11,11 @@ import pytest
 
 import umbra
 from protocol.errors import Code, UmbraError
-from protocol.messages import RigState, RunState, StageChanged, StageState
+from protocol.messages.events import StageChanged
+from protocol.messages.rig import RigState, StageState
+from protocol.messages.runs import RunState
 from tests.drivers.grbl_peer import GrblPeer
-from tests.system.harness import Daemon, recorded, until
+from tests.system.harness import ENDLESS, Daemon, recorded, until
 
 pytestmark = pytest.mark.system
 
@@ -100,7 +102,7 @@ def test_refused_while_held_by_another_or_scanning(staged: Daemon) -> None:
             assert caught.value.code is Code.LOCKED
             rig.stage_circle((100, 100), 10, 100)
             assert other.stage_stop().state is StageState.IDLE  # to stop is never refused
-        run = rig.scan(umbra.Checkerboard(average=20))
+        run = rig.scan(ENDLESS)
         recorded(rig, run.id, 2)
         assert rig.stage().position_mm is not None
         for act in (rig.stage_stop, rig.stage_home, lambda: rig.stage_move(10, 10, 50)):

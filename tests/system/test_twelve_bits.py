@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from daemon.patterns import render
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Expose
-from drivers.base import CameraInfo, PixelFormat, ProjectorInfo
+from drivers.base.camera import CameraInfo
+from drivers.base.pixelformat import PixelFormat
+from drivers.base.projector import ProjectorInfo
 from drivers.registry import UnknownDriver, load
-from protocol.scans import Checkerboard
+from protocol.scans.projected import Checkerboard
 from tests.drivers import aravis_peer, gentl_peer
 from tests.system.harness import Daemon
 
@@ -108,7 +110,12 @@ def aravis(tmp_path: Path) -> Iterator[str]:
     np.save(tmp_path / "film.npy", film())
     film_file = str(tmp_path / "film.npy")
     program = [sys.executable, aravis_peer.__file__, "127.0.0.1", "GV12", film_file]
-    with subprocess.Popen(program) as camera:
+    with (
+        aravis_peer.loopback(),
+        subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as camera,
+    ):
+        assert camera.stdout is not None
+        assert camera.stdout.readline() == "ready\n"
         yield f"""
 driver = "aravis"
 address = "127.0.0.1"
