@@ -239,7 +239,10 @@ def test_stopping_with_the_parent(daemon: Daemon) -> None:
 def test_a_bad_configuration_exits_with_2(daemon: Daemon) -> None:
     daemon.config.write_text("[camera]\ndriver = 'virtual'\nwdth = 3\n")
     assert daemon.launch_cold().wait(60) == 2
-    assert daemon.log().strip() == f"umbrad: {daemon.config}: camera.wdth: there is no such key"
+    assert (
+        daemon.log().strip()
+        == f'umbrad: {daemon.config}: camera.wdth: there is no such key; did you mean "width"?'
+    )
 
 
 def test_an_emergency_stop_before_the_run_has_the_devices(daemon: Daemon) -> None:
