@@ -19,7 +19,8 @@ help:  ## say what there is
 demo: $(VENV)/.runtime  ## a scan on the virtual rig, with its result in demo-out
 	$(BIN)/umbra demo -o demo-out --force $(ARGS)
 
-WORKERS ?= auto
+# One more than there are cores: tests of real processes wait at times, and another may compute then.
+WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
 
 test: $(VENV)/.dev  ## the whole suite; ARGS="-k name" for a part of it
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)

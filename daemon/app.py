@@ -26,21 +26,22 @@ import zmq
 import zmq.asyncio
 
 from daemon import __version__, config, logs
-from daemon.access import Access, check_exposure, check_keys
-from daemon.commands import Commands
+from daemon.devices.rig import SAFE_S, Rig
 from daemon.doctor.examination import Doctor
-from daemon.manual import Manual
+from daemon.manual.manual import Manual
 from daemon.notify import Notifier
-from daemon.publisher import HIGH_WATER, Publisher
-from daemon.reprocessor import Reprocessor
-from daemon.rig import SAFE_S, Rig
-from daemon.runner import LOCK, Runner
-from daemon.server import Server
-from daemon.store import Store
-from daemon.viewfinder import Glimpse, Viewfinder
+from daemon.pictures.viewfinder import Glimpse, Viewfinder
+from daemon.runs.reprocessor import Reprocessor
+from daemon.runs.runner import LOCK, Runner
+from daemon.serving.access import Access, check_exposure, check_keys
+from daemon.serving.commands import Commands
+from daemon.serving.publisher import HIGH_WATER, Publisher
+from daemon.serving.server import Server
+from daemon.storage.store import Store
 from protocol.errors import UmbraError
 from protocol.messages.events import AnyEvent, DeviceChanged, Logged, PreviewTaken
 from protocol.messages.rig import DeviceInfo, RigState
+from protocol.wire import MOST_BYTES
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """What ends the daemon in an orderly way: the service manager, Ctrl-C, a terminal that closes."""
@@ -290,6 +291,7 @@ class _Daemon:
             socket.sndhwm = HIGH_WATER
         else:
             socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
+            socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)  # more than that is no request
         access.lock(socket)
         try:
             socket.bind(endpoint)

@@ -12,8 +12,9 @@ from msgspec import Meta
 
 from drivers import registry
 from protocol.messages.access import DEFAULT_COMMAND, DEFAULT_EVENTS
+from protocol.spelling import did_you_mean, fields_at
 
-_T = TypeVar("_T")
+_T = TypeVar("_T", bound=msgspec.Struct)
 
 
 class ConfigError(Exception):
@@ -194,5 +195,7 @@ def _convert(tables: Any, into: type[_T], origin: str, prefix: str) -> _T:
         where = (prefix + path.rstrip("`")).lstrip(".")
         if problem.startswith("Object contains unknown field"):
             field = problem.split("`")[1]
-            where, problem = f"{where}.{field}".lstrip("."), "there is no such key"
+            known = fields_at(into, path)
+            where = f"{where}.{field}".lstrip(".")
+            problem = "there is no such key" + did_you_mean(field, known)
         raise ConfigError(f"{origin}: {where}: {problem}") from error

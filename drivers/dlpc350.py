@@ -36,16 +36,15 @@ from drivers.base.device import Context, Identity, Options
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.projector import LoadedSequence, Projector, ProjectorInfo, SequenceLimits
 from drivers.clock import NS
+from drivers.dlpc350_board import Board, Pulse
 from drivers.dlpc350_flash import FlashImages, Place
 from drivers.dlpc350_protocol import Command, Entry
 from drivers.dlpc_hid import DlpcHid, attached
-from drivers.registry import UnknownDriver
+from drivers.registry import UnknownDriver, install
 
 if TYPE_CHECKING:
     from drivers.display import DisplayProjector
 
-POLL_S = 0.02
-SETTLE_S = 5.0  # a change of mode takes a moment, waking from standby about two seconds
 FLASH_REFRESH_HZ = 60.0
 VIDEO = Place(-1, 0, 8)  # not in flash: green's eight bits of each video frame
 MARGIN_US = 250  # of a video frame, that patterns leave free
@@ -84,12 +83,14 @@ class Dlpc350Projector(Projector):
             )
         self._o = options
         self._led = p.Led[options.led.upper()]
+        self._halted = threading.Event()
         self._hid = DlpcHid(
             name, p.LIGHTCRAFTER_4500, options.serial, options.port, context.shared.get("usb")
         )
+        pulse = Pulse(options.trigger_delay_us, options.trigger_active_low)
+        self._board = Board(name, self._hid, self.clock, self._halted, pulse)
         self._screen = None if options.display is None else _display(name, options, context)
         self._flash = FlashImages(name, options.flash, options.flash_load_ms)
-        self._halted = threading.Event()
         self._refresh_hz = FLASH_REFRESH_HZ
         self._showing: Place | None = None
         self._loaded: LoadedSequence | None = None
@@ -106,24 +107,19 @@ class Dlpc350Projector(Projector):
         try:
             place = self._hid.open()
             firmware = p.version(self._hid.read(Command.VERSION, "connect"))
-            self._wake("connect")
-            self._write(Command.LEDS, p.LEDS_OFF, "connect")
+            self._board.wake("connect")
+            self._board.write(Command.LEDS, p.LEDS_OFF, "connect")
             if self._screen is None:
                 self._flash.read()
             else:
                 self._screen.connect()
                 self._refresh_hz = self._screen.info().refresh_hz
-                self._write(Command.INPUT, PARALLEL_24, "connect")
+                self._board.write(Command.INPUT, PARALLEL_24, "connect")
         except DeviceError:
             self.close()
             raise
         self.check()
         return Identity(p.LIGHTCRAFTER_4500.name, place.serial or place.port, firmware)
-
-    def _wake(self, phase: str) -> None:
-        self._write(Command.POWER, b"\x00", phase)
-        self._until(phase, "wake from standby", Command.POWER, 0x03, 0)
-        self._until(phase, "finish its start", Command.HARDWARE_STATUS, 1 << p.HARDWARE_READY, 1)
 
     def check(self) -> None:
         """See Device. Raises DeviceRefused for what the controller reports of itself."""
@@ -142,7 +138,7 @@ class Dlpc350Projector(Projector):
         """See Device: LEDs off, and in standby where rig.toml says so."""
         self._dark("safe")
         if self._o.standby:
-            self._write(Command.POWER, b"\x01", "safe")
+            self._board.write(Command.POWER, b"\x01", "safe")
 
     def stop(self) -> None:
         """See Projector: LEDs off."""
@@ -151,11 +147,11 @@ class Dlpc350Projector(Projector):
     def _dark(self, phase: str) -> None:
         self._halted.clear()  # what was halted has ended; this must not end with it
         try:
-            self._write(Command.LEDS, p.LEDS_OFF, phase)  # first: it is dark from here on
+            self._board.write(Command.LEDS, p.LEDS_OFF, phase)  # first: it is dark from here on
             self._showing = None
-            self._end(phase)
+            self._board.stop(phase)
         except DeviceRefused:
-            if not self._in_standby(phase):  # where it is dark, and takes no such commands
+            if not self._board.in_standby(phase):  # where it is dark, and takes no such commands
                 raise
 
     def halt(self) -> None:
@@ -230,8 +226,9 @@ class Dlpc350Projector(Projector):
             return self._show_flash(mirrors)
         if self._showing != VIDEO:
             entry = Entry(VIDEO.number, bits=VIDEO.bits, led=self._led, external=True)
-            self._prepare("show", [entry], [], self._frame_us, self._frame_us, repeat=True)
-            self._start("show", VIDEO)
+            self._program("show", [entry], [], self._frame_us, self._frame_us, repeat=True)
+            self._board.play("show")
+            self._showing = VIDEO
         lit = self._screen.show(np.repeat(mirrors[..., None], 3, axis=2))
         return lit + round(VIDEO_LATENCY_FRAMES * NS / self._refresh_hz)
 
@@ -241,14 +238,10 @@ class Dlpc350Projector(Projector):
             return self.clock.now_ns()
         period = int(1e6 / FLASH_REFRESH_HZ)
         entries, images = [replace(wanted.entry(self._led), swap=True)], [max(wanted.index, 0)]
-        self._prepare("show", entries, images, period, period, repeat=True)
-        self._start("show", wanted)
+        self._program("show", entries, images, period, period, repeat=True)
+        self._board.play("show")
+        self._showing = wanted
         return self.clock.now_ns() + round(self._o.flash_load_ms * 1e6)
-
-    def _start(self, phase: str, showing: Place | None) -> None:
-        self._write(Command.LEDS, p.LEDS_BY_SEQUENCE, phase)
-        self._write(Command.PLAY, bytes((p.Play.START,)), phase)
-        self._showing = showing
 
     # ------------------------------------------------------------ sequences
 
@@ -273,7 +266,7 @@ class Dlpc350Projector(Projector):
         entries = [replace(entry, clear=gaps) for entry in entries]
         entries[-1] = replace(entries[-1], clear=True)
         self._dark("load")
-        self._prepare("load", entries, order, exposure, period, repeat=False)
+        self._program("load", entries, order, exposure, period, repeat=False)
         self._loaded = LoadedSequence(len(images), exposure, period)
         return self._loaded
 
@@ -312,21 +305,20 @@ class Dlpc350Projector(Projector):
         self._halted.clear()
         if self._loaded is None:
             raise self._refuse("run", "no sequence is loaded", "load one first")
-        if self._in_standby("run"):  # its tables may be gone
+        if self._board.in_standby("run"):  # its tables may be gone
             raise self._refuse("run", "it is in standby", "load the sequence again")
-        self._end("run")
+        self._board.stop("run")
         if self._screen is not None:
             assert self._frame is not None
             there = self._screen.show(self._frame) + round(NS / self._refresh_hz)
             if self.clock.wait_until(there, self._halted):
                 raise DeviceTimeout(self.name, "run", "halted before it began", "run it again")
         began = self.clock.now_ns()
-        self._start("run", None)
+        self._board.play("run")
+        self._showing = None
         return began
 
-    # ------------------------------------------------------------ the board
-
-    def _prepare(
+    def _program(
         self,
         phase: str,
         entries: list[Entry],
@@ -336,67 +328,17 @@ class Dlpc350Projector(Projector):
         *,
         repeat: bool,
     ) -> None:
-        """Stop, and program the board's tables; nothing is lit yet."""
+        """Stop, and program the board; nothing is lit yet."""
         self._loaded = self._showing = None
-        if self._in_standby(phase):
-            self._wake(phase)
-        self._end(phase)
-        video = self._screen is not None
-        if self._hid.read(Command.MODE, phase)[0] != p.Mode.PATTERN:
-            self._write(Command.MODE, bytes((p.Mode.PATTERN,)), phase)
-            self._until(phase, "change its mode", Command.MODE, 0xFF, p.Mode.PATTERN)
-        source = p.Source.VIDEO_PORT if video else p.Source.FLASH
-        trigger = p.TriggerMode.VSYNC if video else p.TriggerMode.INTERNAL
-        edge = p.trigger_edge(self._o.trigger_delay_us)
-        low = int(self._o.trigger_active_low)
-        data = b"".join(entry.packed() for entry in entries)
-        for command, value in (
-            (Command.PATTERN_SOURCE, bytes((source,))),
-            (Command.TABLE, p.table(len(entries), max(len(images), 1), repeat=repeat)),
-            (Command.TIMING, p.timing(exposure_us, period_us)),
-            (Command.TRIGGER_MODE, bytes((trigger,))),
-            (Command.TRIGGER_OUT_1, bytes((low, edge, p.TRIGGER_ZERO))),
-            (Command.TRIGGER_OUT_2, bytes((low, edge))),
-            *_mailbox(p.Mailbox.PATTERNS, data),
-            *(_mailbox(p.Mailbox.IMAGES, p.image_table(images)) if images else ()),
-            (Command.VALIDATE, b"\x00"),
-        ):
-            self._write(command, value, phase)
-        status = self._until(phase, "check the patterns", Command.VALIDATE, p.VALIDATING, 0)
-        self._warnings = p.words(status & p.WARNINGS, p.INVALID)
-        invalid = p.words(status & ~p.WARNINGS, p.INVALID)
-        if invalid:
-            raise self._refuse(
-                phase, "the board says that " + ", and ".join(invalid), "choose other times"
-            )
-
-    def _in_standby(self, phase: str) -> bool:
-        return self._hid.read(Command.POWER, phase)[0] & 0x03 != 0
-
-    def _end(self, phase: str) -> None:
-        """Stop patterns."""
-        self._write(Command.PLAY, bytes((p.Play.STOP,)), phase)
-        self._until(phase, "stop", Command.PLAY, 0x03, p.Play.STOP)
-
-    def _until(self, phase: str, what: str, command: Command, mask: int, wanted: int) -> int:
-        """Ask until a register's bits are as wanted; gives the register."""
-        deadline = self.clock.now_ns() + round(SETTLE_S * NS)
-        while True:
-            status = self._hid.read(command, phase)[0]
-            if status & mask == wanted:
-                return status
-            halted = self.clock.wait(POLL_S, self._halted)
-            if halted or self.clock.now_ns() > deadline:
-                raise DeviceTimeout(
-                    self.name,
-                    phase,
-                    f"halted before it could {what}" if halted
-                    else f"it did not {what} within {SETTLE_S:g} s",
-                    "try again; switch it off and on if that does not help",
-                )  # fmt: skip
-
-    def _write(self, command: Command, data: bytes, phase: str) -> None:
-        self._hid.write(command, phase, data)
+        self._warnings = self._board.program(
+            phase,
+            entries,
+            images,
+            exposure_us,
+            period_us,
+            video=self._screen is not None,
+            repeat=repeat,
+        )
 
     def _refuse(self, phase: str, problem: str, remedy: str) -> DeviceRefused:
         return DeviceRefused(self.name, phase, problem, remedy)
@@ -416,15 +358,6 @@ class Dlpc350Projector(Projector):
         return dmd.to_mirrors(image, odd_rows_right=self._o.odd_rows_right)
 
 
-def _mailbox(which: p.Mailbox, data: bytes) -> list[tuple[Command, bytes]]:
-    return [
-        (Command.MAILBOX, bytes((which,))),
-        (Command.MAILBOX_ADDRESS, b"\x00"),
-        (Command.MAILBOX_DATA, data),
-        (Command.MAILBOX, bytes((p.Mailbox.CLOSED,))),
-    ]
-
-
 def _display(name: str, options: Dlpc350Options, context: Context) -> DisplayProjector:
     """The HDMI side, at the DMD's own size: anything else would be scaled by the board."""
     try:
@@ -433,7 +366,7 @@ def _display(name: str, options: Dlpc350Options, context: Context) -> DisplayPro
     except ImportError as error:
         raise UnknownDriver(
             f"{name}: dlpc350 with a `display` needs {error.name}, which is not installed: "
-            "pip install 'umbra-rig[display]'"
+            + install("display")
         ) from error
     keys = {"latency_frames": 2.0} | (options.display or {})
     keys["size"] = (dmd.COLUMNS, dmd.ROWS)

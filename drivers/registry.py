@@ -27,6 +27,11 @@ def names(kind: str) -> tuple[str, ...]:
     return tuple(sorted({e.name.removeprefix(prefix) for e in found if e.name.startswith(prefix)}))
 
 
+def install(extra: str) -> str:
+    """How an extra is installed: what works before there is a release on an index, too."""
+    return f"in a checkout `pip install '.[{extra}]'`, or `pip install 'umbra-rig[{extra}]'`"
+
+
 def load(kind: str, driver: str) -> type[Device]:
     """A driver's class. Raises UnknownDriver, also when the package that it needs is missing."""
     for entry in metadata.entry_points(group=GROUP, name=f"{kind}.{driver}"):
@@ -35,7 +40,7 @@ def load(kind: str, driver: str) -> type[Device]:
         except ImportError as error:
             raise UnknownDriver(
                 f"{kind} driver {driver!r} needs {error.name}, which is not installed: "
-                f"pip install 'umbra-rig[{driver}]'"
+                f"{install(driver)}"
             ) from error
         if not (isinstance(cls, type) and issubclass(cls, Device) and cls.kind == kind):
             raise UnknownDriver(f"{entry.value} is not a {kind} driver")

@@ -21,6 +21,7 @@ import zmq.asyncio
 
 from protocol.aio_run import AsyncRun
 from protocol.arrivals import arrival, place_for
+from protocol.bothways import Awaited
 from protocol.commands import Commands
 from protocol.connection import (
     ATTEMPTS,
@@ -44,7 +45,7 @@ T = TypeVar("T")
 log = logging.getLogger("umbra")
 
 
-class AsyncClient(Commands):
+class AsyncClient(Awaited, Commands):
     """A connection to a rig, with a coroutine for each command. For one loop."""
 
     welcome: Welcome

@@ -5,16 +5,20 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Coroutine
-from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
 from protocol.connection import Ask
 
-if TYPE_CHECKING:
-    from protocol.aio import AsyncClient
-    from protocol.client import Client
-
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+class Blocking:
+    """A client whose `perform` comes back with what an Ask is for."""
+
+
+class Awaited:
+    """A client whose `perform` is a coroutine."""
 
 
 class command(Generic[P, T]):  # noqa: N801  (a decorator, as property is)
@@ -27,9 +31,9 @@ class command(Generic[P, T]):  # noqa: N801  (a decorator, as property is)
     @overload
     def __get__(self, rig: None, owner: type) -> Callable[Concatenate[Any, P], Ask[T]]: ...
     @overload
-    def __get__(self, rig: Client, owner: type) -> Callable[P, T]: ...
+    def __get__(self, rig: Blocking, owner: type) -> Callable[P, T]: ...
     @overload
-    def __get__(self, rig: AsyncClient, owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
+    def __get__(self, rig: Awaited, owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
     def __get__(self, rig: Any, owner: type) -> Any:
         if rig is None:
             return self._make

@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeVar
 import zmq
 
 from protocol.arrivals import arrival, place_for
+from protocol.bothways import Blocking
 from protocol.commands import Commands
 from protocol.connection import (
     ATTEMPTS,
@@ -59,7 +60,7 @@ def connect(
     return Client(endpoint, keys=keys, timeout_s=timeout_s, name=name)
 
 
-class Client(Commands):
+class Client(Blocking, Commands):
     """A connection to a rig, with a blocking method for each command."""
 
     def __init__(

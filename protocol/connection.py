@@ -33,7 +33,7 @@ from protocol.messages.commands import AnyCommand
 from protocol.messages.envelopes import PROTOCOL, Event, Request, Response
 from protocol.messages.events import AnyEvent, Logged, PreviewTaken
 from protocol.messages.replies import AnyReply, Reply, Welcome
-from protocol.wire import Arrays, arrays_of, decode, encode
+from protocol.wire import MOST_BYTES, Arrays, arrays_of, decode, encode
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -223,6 +223,11 @@ class Exchange(Generic[T]):
         self.message = encode(
             Request(id=self.id, protocol=PROTOCOL, command=ask.command, token=token)
         )
+        if (size := len(self.message[0])) > MOST_BYTES:
+            raise UmbraError(
+                Code.BAD_REQUEST,
+                f"the request has {size / 1e6:.1f} MB, at most {MOST_BYTES / 1e6:.1f} are taken",
+            )
 
     def value(self, frames: Sequence[zmq.Frame]) -> T:
         """What this response, which must be the one of this id, says.

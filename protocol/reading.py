@@ -73,7 +73,8 @@ def changeable(struct: type[msgspec.Struct]) -> list[str]:
 
 
 def changed(spec: AnyScan, changes: Mapping[str, Any]) -> AnyScan:
-    """The spec with other values (JSON-able) for some of its fields, by name.
+    """The spec with other values (JSON-able) for some of its fields, by name; None: as if it had
+    not been said.
 
     Raises UmbraError: unsuitable for a field that is in the frames and for a calibration,
     bad_request for one that there is not, or a value that it cannot have.
@@ -104,7 +105,10 @@ def changed(spec: AnyScan, changes: Mapping[str, Any]) -> AnyScan:
         level = plain
         for step in where[name][:-1]:
             level = level[step]
-        level[name] = value
+        if value is None:
+            level.pop(name, None)
+        else:
+            level[name] = value
     try:
         return cast(AnyScan, msgspec.convert(plain, type(spec)))
     except msgspec.ValidationError as error:

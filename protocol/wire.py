@@ -21,6 +21,9 @@ if TYPE_CHECKING:  # NumPy is loaded with the first array: most commands carry n
 Arrays: TypeAlias = "Mapping[str, NDArray[Any]]"
 T = TypeVar("T")
 
+MOST_BYTES = 4 << 20
+"""Of a request's frame; a daemon closes the connection on more."""
+
 _ALLOWED = {"uint8", "uint16", "float32", "bool"}
 _encoder = msgspec.json.Encoder()
 
@@ -52,6 +55,8 @@ def decode(decoder: msgspec.json.Decoder[T], header: bytes | memoryview) -> T:
     except msgspec.DecodeError as error:
         message, _, where = str(error).partition(" - at `")
         raise UmbraError(Code.BAD_REQUEST, message, where.rstrip("`")) from error
+    except RecursionError as error:
+        raise UmbraError(Code.BAD_REQUEST, "it is nested without end") from error
 
 
 def arrays_of(

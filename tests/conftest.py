@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -17,6 +18,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # then, which takes longer than most tests of one.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+# What is committed is fsynced, a thousand times a minute here: milliseconds on a disk, nothing in
+# memory, where there is room and a test may build a program.
+_MEMORY = Path("/dev/shm")
+if os.access(_MEMORY, os.W_OK):
+    _facts = os.statvfs(_MEMORY)
+    if _facts.f_bavail * _facts.f_frsize > 4 << 30 and not _facts.f_flag & os.ST_NOEXEC:
+        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
 
 # The same examples each time, and as slow as the machine is: a test fails for what it has found.
 settings.register_profile(

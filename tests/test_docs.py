@@ -13,9 +13,9 @@ import pytest
 from typer.main import get_command
 
 from daemon import config
-from daemon.frames import FrameRecord
-from daemon.runfolder import RunFile
 from daemon.separation.estimator import Quality
+from daemon.storage.frames import FrameRecord
+from daemon.storage.runfolder import RunFile
 from drivers import registry
 from protocol.cli.app import app
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from daemon.devicethread import DeviceThread, Session
+from daemon.devices.devicethread import DeviceThread, Session
 from daemon.doctor.verdict import failed, ok, skipped, warning
 from drivers.base.errors import DeviceRefused
 from drivers.base.projector import Projector

@@ -10,7 +10,8 @@ from pathlib import Path
 import structlog
 
 from daemon.config import RigConfig
-from daemon.devicethread import Revoked, Session
+from daemon.devices.devicethread import Revoked, Session
+from daemon.devices.rig import Rig
 from daemon.doctor import (
     clocks,
     devices,
@@ -23,9 +24,8 @@ from daemon.doctor import (
     software,
 )
 from daemon.doctor.verdict import failed, skipped
-from daemon.manual import Manual
-from daemon.rig import Rig
-from daemon.store import Store
+from daemon.manual.manual import Manual
+from daemon.storage.store import Store
 from drivers.base.camera import CameraInfo
 from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from daemon.devicethread import DeviceThread, Session
+from daemon.devices.devicethread import DeviceThread, Session
 from daemon.doctor.verdict import failed, ok, skipped, warning
 from daemon.exposing.modes import whole_periods
 from drivers.base.camera import Acquisition, Camera, Frame

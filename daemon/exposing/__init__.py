@@ -1,1 +1,5 @@
-"""The ways of exposing: one file each, chosen by `modes`, behind the face in `exposer`."""
+"""A step becomes frames: shown or moved, exposed in step, proven, recorded.
+
+The sequencer has the steps exposed, each way of exposing in a file of its own behind the face in
+`exposer`, chosen by `modes`; the recorder takes the frames.
+"""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.devicethread import DeviceThread, Session
+from daemon.devices.devicethread import DeviceThread, Session
 from daemon.exposing.apparatus import CALL_S
 from drivers.base.camera import Acquisition, Camera
 from drivers.base.errors import EndOfRecording

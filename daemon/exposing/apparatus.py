@@ -16,14 +16,14 @@ import structlog
 from numpy.typing import NDArray
 
 from daemon.config import SequencerSection
-from daemon.control import Control
-from daemon.devicethread import Session
+from daemon.devices.devicethread import Session
+from daemon.devices.rig import SAFE_S, Rig
+from daemon.exposing.control import Control
 from daemon.exposing.exposer import Behind
+from daemon.exposing.proof import Look, Proof, look_of
+from daemon.exposing.recorder import Exposed, Recorder
+from daemon.exposing.ring import Buffer, Ring
 from daemon.patterns import predistorted, render
-from daemon.proof import Look, Proof, look_of
-from daemon.recorder import Exposed, Recorder
-from daemon.rig import SAFE_S, Rig
-from daemon.ring import Buffer, Ring
 from daemon.scans.method import Expose, Method, Step
 from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
 from drivers.clock import NS
@@ -95,7 +95,7 @@ class Apparatus:
         self.lit: Lit | None = None
         full_scale = self.info.pixel_format.full_scale
         self.looks = Proof(full_scale) if method.looked_at else None
-        self.counts: dict[str, int] = {}  # frames handed on and exposures repeated, by name
+        self._exposing: dict[str, int] = {}  # since the last record, see `FrameRecord`
         calibration = method.bench.calibration or {}
         self._latency_ns = round(float(calibration.get("latency_s", 0.0)) * NS)
         self._tone: list[int] | None = calibration.get("tone")
@@ -268,6 +268,7 @@ class Apparatus:
                 buffer=buffer,
                 stage_mm=stage_mm,
                 lit_ns=lit_ns,
+                exposing=self._counted(),
             )
         )
 
@@ -275,11 +276,24 @@ class Apparatus:
         """Record that a frame could not be had, and why."""
         self._taken += 1
         log.error("frame missing", step=index, sub=sub, reason=reason)
-        self.recorder.put(Exposed(step=step, index=index, sub=sub, frame=None, missing=reason))
+        self.recorder.put(
+            Exposed(
+                step=step,
+                index=index,
+                sub=sub,
+                frame=None,
+                missing=reason,
+                exposing=self._counted(),
+            )
+        )
 
     def count(self, name: str, more: int = 1) -> None:
         """Count what run.json tells about the exposing."""
-        self.counts[name] = self.counts.get(name, 0) + more
+        self._exposing[name] = self._exposing.get(name, 0) + more
+
+    def _counted(self) -> dict[str, int]:
+        counted, self._exposing = self._exposing, {}
+        return counted
 
     def out_of_light(self, frame: Frame, from_ns: int, until_ns: int) -> str:
         """Why a frame was not exposed wholly within a time; "" if it was. 0: no end to it."""

@@ -8,7 +8,7 @@ Consecutive steps become one sequence, as long as projector and ring allow; the 
 That frame k shows image k is proven three times: there are exactly as many frames as images, none
 lost on its way, one period apart by the camera's own clock (drivers.sequence); the white and the
 black image at its head look bright and dark, so that the light is not a period late or early; and
-each frame looks like its pattern (daemon.proof). Frames are handed on only when all of it holds.
+each frame looks like its pattern (daemon.exposing.proof). Frames are handed on only when all holds.
 Otherwise the whole sequence is run again, `attempts` times in all, each at half the pace of the one
 before, for a host that cannot take frames as fast as its camera gives them loses some; then each of
 its frames is an explicit missing record. When no pulse ever gave a frame, the run fails: that is
@@ -26,45 +26,30 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import Future
 from concurrent.futures import wait as wait_for
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import structlog
-from numpy.typing import NDArray
 
-from daemon.devicethread import Stuck
-from daemon.exposing.apparatus import CALL_S, LOOK_S, SHOW_S, Apparatus, Drawing
+from daemon.devices.devicethread import Stuck
+from daemon.exposing.apparatus import CALL_S, LOOK_S, SHOW_S, Apparatus
+from daemon.exposing.batches import Batches, Shot
 from daemon.exposing.exposer import Exposer
-from daemon.exposing.modes import GUARDS, Pace, pace
-from daemon.proof import Proof, head_problem
-from daemon.ring import Buffer
+from daemon.exposing.modes import GUARDS
+from daemon.exposing.proof import Proof, head_problem
+from daemon.exposing.ring import Buffer
 from daemon.scans.method import Expose, Unsuitable
-from daemon.separation.estimator import Lighting
 from drivers.base.camera import Acquisition, Camera, Frame
 from drivers.base.errors import DeviceError, DeviceGarbled, DeviceRefused, DeviceTimeout
-from drivers.base.projector import LoadedSequence, SequenceLimits
+from drivers.base.projector import LoadedSequence
 from drivers.sequence import mismatch
-from protocol.patterns import BLACK, WHITE
 
 WAY = "hardware"
-IMAGES_BYTES = 256 << 20
-"""Memory that the images of a sequence may take."""
 _LOAD_S = 30.0
 _START_S = 1.0  # from `run` to the first pulse, beyond a frame's own deadline
-_SLOWEST = 8  # times the shortest period: slower than that, nobody loses frames for want of time
 _BEYOND = 1.5  # periods after the last frame in which none may come
 
 log = structlog.get_logger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class _Shot:
-    """A frame that is wanted, with what to show for it."""
-
-    index: int
-    step: Expose
-    sub: int
-    drawing: Drawing
 
 
 class _CalledOff(Exception):
@@ -84,11 +69,7 @@ class Sequences(Exposer):
         self._single = single
         self._strict = strict
         self._projector = apparatus.projector
-        self._limits: SequenceLimits = limits
-        self._most = limits.images  # fewer once the projector has refused so many
-        self._ahead: tuple[tuple[int, int], list[_Shot]] | None = None
-        self._slower = 1  # periods are so many times as long as they need be
-        self._told: set[str] = set()  # why steps are exposed by themselves
+        self._batches = Batches(apparatus, limits, strict=strict)
 
     def settle(self) -> None:
         """See Exposer."""
@@ -100,8 +81,7 @@ class Sequences(Exposer):
         if first >= step.frames:
             return index + 1, 0
         at = (index, first)
-        shots = self._ahead[1] if self._ahead and self._ahead[0] == at else self._gather(*at)
-        self._ahead = None
+        shots = self._batches.take(at)
         if not shots or (len(shots) <= GUARDS and self._single is not None):
             return self._alone(index, step, first)  # a sequence would be more guards than frames
         self.settle()
@@ -113,65 +93,6 @@ class Sequences(Exposer):
         except DeviceRefused as error:
             return self._refused(error, at, step, len(shots))
 
-    # ------------------------------------------------------------ which frames
-
-    def _gather(self, index: int, first: int) -> list[_Shot]:
-        """The frames from a place of the plan on that one sequence can hold."""
-        shots: list[_Shot] = []
-        drawing: Drawing | None = None
-        most, head = 0, index
-        while isinstance(step := self._its.method.step(index, self._its.recorder.summary), Expose):
-            if shots and step.exposure_us != shots[0].step.exposure_us:
-                break
-            if index == head:
-                most = self._room(step)
-            if not most or step.pattern is None or step.delay_s or len(shots) >= most:
-                break
-            if drawing is None or drawing.pattern != step.pattern:
-                drawing = self._its.draw(step.pattern)
-            if not self._has_levels(drawing.image):
-                break
-            room = most - len(shots)
-            subs = range(first, step.frames)[:room]
-            shots += [_Shot(index, step, sub, drawing) for sub in subs]
-            index, first = index + 1, 0
-        return shots
-
-    def _room(self, step: Expose) -> int:
-        """How many frames a sequence can hold at a step's exposure; 0: it can be none."""
-        try:
-            found = self._pace(step)
-        except Unsuitable as error:
-            if self._strict:
-                raise
-            self._tell(str(error))
-            return 0
-        info = self._projector.device.info()
-        images = min(found.images, self._most, IMAGES_BYTES // (info.width * info.height))
-        # Half of the ring: the other half is being recorded meanwhile.
-        return max(0, min(images - GUARDS, (self._its.ring.count + 1) // 2))
-
-    def _pace(self, step: Expose) -> Pace:
-        exposure_us = step.exposure_us or self._its.first_exposure_us or 0.0
-        info = self._its.info
-        wanted = pace(info, self._limits, exposure_us, self._its.patience.period_us)
-        if self._slower == 1:
-            return wanted
-        try:
-            return pace(info, self._limits, exposure_us, self._slower * wanted.period_us)
-        except Unsuitable:
-            return wanted  # it is as slow as it can be
-
-    def _has_levels(self, image: NDArray[np.uint8]) -> bool:
-        """Whether sequences have the image's levels."""
-        if self._limits.bits > 1 or bool(((image == 0) | (image == 255)).all()):
-            return True
-        why = "a pattern has grey levels, and the projector's sequences are black and white only"
-        if self._strict:
-            raise Unsuitable(f"mode hardware: {why}: take mode auto or software", "$.mode")
-        self._tell(why)
-        return False
-
     def _refused(
         self, error: DeviceRefused, at: tuple[int, int], step: Expose, frames: int
     ) -> tuple[int, int]:
@@ -179,12 +100,11 @@ class Sequences(Exposer):
         if error.device != self._projector.device.name or error.phase != "load":
             raise error
         if frames > 1:
-            self._most = GUARDS + frames // 2
-            log.info("shorter sequences", images=self._most, problem=error.problem)
+            self._batches.shorten(frames // 2, error.problem)
             return at
         if self._strict:
             raise error
-        self._tell(str(error))
+        self._batches.tell(str(error))
         return self._alone(at[0], step, at[1])
 
     def _alone(self, index: int, step: Expose, first: int) -> tuple[int, int]:
@@ -195,16 +115,11 @@ class Sequences(Exposer):
             )
         return self._single.expose(index, step, first)
 
-    def _tell(self, why: str) -> None:
-        if why not in self._told:
-            self._told.add(why)
-            log.info("exposed one by one", reason=why)
-
     # ------------------------------------------------------------ one sequence
 
-    def _sequence(self, shots: list[_Shot]) -> tuple[int, int]:
+    def _sequence(self, shots: list[Shot]) -> tuple[int, int]:
         its = self._its
-        guards = self._guards()
+        guards = self._batches.guards()
         shape, dtype = its.info.shape, its.info.pixel_format.dtype
         scratch = [np.empty(shape, dtype) for _ in guards]
         buffers: list[Buffer] = []
@@ -223,7 +138,7 @@ class Sequences(Exposer):
                     for shot, frame in zip(shots, found[len(guards) :], strict=True):
                         buffer = buffers.pop(0)
                         its.put(shot.index, shot.step, shot.sub, frame, buffer, way=WAY)
-                    return self._after(shots[-1])
+                    return _after(shots[-1])
                 its.count("repeated")
                 log.warning(
                     "sequence exposed again" if attempt < its.patience.attempts else "given up",
@@ -233,40 +148,27 @@ class Sequences(Exposer):
                     problem=problem,
                 )
                 if attempt < its.patience.attempts:
-                    self._slower = min(2 * self._slower, _SLOWEST)
+                    self._batches.slow_down()
                     its.acquire(Acquisition.HARDWARE)
                     loaded = self._load([*guards, *shots])
             if not found:
                 raise self._nothing_came(loaded)
             for shot in shots:
                 its.miss(shot.index, shot.step, shot.sub, problem)
-            return self._after(shots[-1])
+            return _after(shots[-1])
         finally:
             for buffer in buffers:
                 its.ring.give(buffer)
 
-    def _guards(self) -> list[_Shot]:
-        """White, then black. Light that is a period late makes them dark and white; early, black
-        and the first pattern: never the first brighter than the second."""
-        return [
-            _Shot(-1, Expose(pattern, lighting), 0, self._its.draw(pattern))
-            for pattern, lighting in ((WHITE, Lighting.WHITE), (BLACK, Lighting.BLACK))
-        ]
-
-    def _load(self, shots: Sequence[_Shot]) -> LoadedSequence:
+    def _load(self, shots: Sequence[Shot]) -> LoadedSequence:
         images = [shot.drawing.image for shot in shots]
-        period_us = self._pace(shots[-1].step).period_us
+        period_us = self._batches.pace(shots[-1].step).period_us
         return self._projector.call(
             lambda p: p.load(images, period_us, period_us), _LOAD_S, self._its.session
         )
 
-    def _after(self, shot: _Shot) -> tuple[int, int]:
-        """The place of the plan after a frame."""
-        more = shot.sub + 1 < shot.step.frames
-        return (shot.index, shot.sub + 1) if more else (shot.index + 1, 0)
-
     def _attempt(
-        self, loaded: LoadedSequence, shots: Sequence[_Shot], buffers: Sequence[Buffer]
+        self, loaded: LoadedSequence, shots: Sequence[Shot], buffers: Sequence[Buffer]
     ) -> tuple[list[Frame], str]:
         """Run the sequence once: the frames that came, and why they are not its images, or "".
 
@@ -286,7 +188,7 @@ class Sequences(Exposer):
         problem = "it was not run to its end"
         try:
             began_ns = self._projector.call(lambda p: p.run(), SHOW_S, its.session)
-            self._gather_ahead(shots[-1])
+            self._batches.prepare(_after(shots[-1]))  # while this one is exposed
             judges = its.looks.fork() if its.looks is not None else None
             *awaited, beyond = zip(grabs, waits, strict=True)
             problem = self._collect(awaited, shots, frames, judges, loaded, began_ns)
@@ -307,16 +209,10 @@ class Sequences(Exposer):
 
         return self._its.camera.submit(grab, wait_s + CALL_S, self._its.session)
 
-    def _gather_ahead(self, last: _Shot) -> None:
-        """Draw the next sequence while this one is exposed."""
-        at = self._after(last)
-        if self._ahead is None or self._ahead[0] != at:
-            self._ahead = (at, self._gather(*at))
-
     def _collect(
         self,
         grabs: Sequence[tuple[Future[Frame], float]],
-        shots: Sequence[_Shot],
+        shots: Sequence[Shot],
         frames: list[Frame],
         judges: Proof | None,
         loaded: LoadedSequence,
@@ -337,7 +233,7 @@ class Sequences(Exposer):
                 return f"frame {len(frames) - 1} of the sequence: {problem}"
         return ""
 
-    def _of_looks(self, frames: Sequence[Frame], shot: _Shot, judges: Proof | None) -> str:
+    def _of_looks(self, frames: Sequence[Frame], shot: Shot, judges: Proof | None) -> str:
         """Why the last of the frames does not look like what was shown for it; "" if it does."""
         if len(frames) == GUARDS:
             white, black = (frame.pixels for frame in frames)
@@ -400,3 +296,9 @@ class Sequences(Exposer):
             "check the cable from the projector's trigger output, and trigger_line and "
             "trigger_edge in rig.toml; or take mode software",
         )
+
+
+def _after(shot: Shot) -> tuple[int, int]:
+    """The place of the plan after a frame."""
+    more = shot.sub + 1 < shot.step.frames
+    return (shot.index, shot.sub + 1) if more else (shot.index + 1, 0)

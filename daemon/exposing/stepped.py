@@ -10,9 +10,9 @@ ends, so that readout and flip go on side by side:
 For the exposures of a bracket the light stays.
 
 A frame counts only if its exposure lies wholly within the time in which its pattern was lit, by
-the device's own time stamps, and if it looks like its pattern (`daemon.proof`). Repeating is safe
-because a frame that is not recorded has no effect. Photographs are taken in the same way, by a
-camera that needs no light.
+the device's own time stamps, and if it looks like its pattern (`daemon.exposing.proof`). Repeating
+is safe because a frame that is not recorded has no effect. Photographs are taken in the same way,
+by a camera that needs no light.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from dataclasses import dataclass, replace
 
 import structlog
 
-from daemon.devicethread import Stuck
+from daemon.devices.devicethread import Stuck
 from daemon.exposing.apparatus import CALL_S, Apparatus, Lit
 from daemon.exposing.exposer import Exposer
-from daemon.ring import Buffer
+from daemon.exposing.ring import Buffer
 from daemon.scans.method import Expose
 from drivers.base.camera import Acquisition, Frame
 from drivers.base.errors import DeviceGarbled, DeviceTimeout

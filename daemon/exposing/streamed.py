@@ -16,10 +16,10 @@ from __future__ import annotations
 
 import structlog
 
-from daemon.devicethread import Stuck
+from daemon.devices.devicethread import Stuck
 from daemon.exposing.apparatus import CALL_S, Apparatus, Lit
 from daemon.exposing.exposer import Exposer
-from daemon.ring import Buffer
+from daemon.exposing.ring import Buffer
 from daemon.scans.method import Expose
 from drivers.base.camera import Acquisition, Frame
 from drivers.base.errors import DeviceGarbled, DeviceTimeout

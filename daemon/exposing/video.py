@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import structlog
 
-from daemon.devicethread import Stuck
+from daemon.devices.devicethread import Stuck
 from daemon.exposing.apparatus import CALL_S, Apparatus
-from daemon.motion import Mover
-from daemon.ring import Buffer
+from daemon.exposing.motion import Mover
+from daemon.exposing.ring import Buffer
 from daemon.scans.method import Watch
 from drivers.base.camera import Acquisition, Frame
 from drivers.base.errors import DeviceGarbled, DeviceTimeout, EndOfRecording

@@ -32,6 +32,16 @@ class CheckerboardMethod(RankedMethod[Checkerboard]):
         """See `PatternMethod`."""
         return self.spec.checker <= FINE_PX
 
+    @property
+    def period(self) -> int:
+        """See `PatternMethod`."""
+        return 2 * self.spec.checker
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """See `RankedMethod`."""
+        return self.spec.shifts, self.spec.shifts
+
     def described(self) -> str:
         """See `PatternMethod`."""
         return f"{self.spec.shifts} x {self.spec.shifts} shifts"

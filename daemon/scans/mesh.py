@@ -51,12 +51,6 @@ class MeshMethod(OccluderMethod[Mesh]):
         self.hole_fraction = spec.hole_fraction
         if self.hole_fraction is None and self._mesh is not None:
             self.hole_fraction = self._mesh.hole_fraction
-        if self.hole_fraction is None and not {Reference.AMBIENT, Reference.OPEN} <= {*wanted}:
-            raise Unsuitable(
-                "say the mesh's hole fraction (--hole-fraction), or its holes and pitch "
-                "(--hole-mm, --pitch-mm), or give an ambient and an open frame to measure it with",
-                "$.hole_fraction",
-            )
         super().__init__(spec, bench, self._circle(spec, bench) if live else None)
 
     def _circle(self, spec: Mesh, bench: Bench) -> Circle:

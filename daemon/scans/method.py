@@ -42,7 +42,7 @@ class Bench:
     lights: tuple[str, ...] = ()
     exposure_us: float | None = None  # of the camera as it is set
     gain: float | None = None  # the same
-    calibration: Mapping[str, Any] | None = None  # values that apply: see daemon.calibration
+    calibration: Mapping[str, Any] | None = None  # values that apply: see daemon.runs.calibration
 
     def recorded(self) -> dict[str, Any]:
         """As run.json keeps it, JSON-able; the calibration has a place of its own there."""
@@ -130,7 +130,7 @@ class Method(ABC, Generic[S]):
     """A scan in its course. Made from a validated spec and a bench; pure."""
 
     name: ClassVar[str]
-    looked_at: ClassVar[bool] = True  # a frame must look like its pattern: see daemon.proof
+    looked_at: ClassVar[bool] = True  # frames must look like their patterns: see exposing.proof
 
     def __init__(self, spec: S, bench: Bench) -> None:
         """Raises Unsuitable when the rig lacks what the scan needs, or the numbers don't fit."""

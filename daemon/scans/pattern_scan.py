@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import ClassVar, TypeVar
 
 import cv2
@@ -17,12 +18,11 @@ from daemon.scans.method import Bench, Expose, Method, Step, Taken, Unsuitable
 from daemon.separation.bracket import Bracketed
 from daemon.separation.estimator import Estimator, Lighting, Observation
 from daemon.separation.exposure_noise import ROUNDING, Sensor
-from daemon.separation.extremes import MaxMin
+from daemon.separation.extremes import Extremes
 from daemon.separation.frameset import FrameSet, Watched
 from daemon.separation.noise import Noise
 from daemon.separation.order_estimate import KEEP, RANKS
 from daemon.separation.radiometry import Response
-from daemon.separation.topk import TopK
 from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.scans.projected import PatternScan
 from protocol.scans.spec import Radiometry, Reference
@@ -31,6 +31,7 @@ FINE_PX = 64
 """Patterns of larger checkers, patches or periods may light one end of a scene alone."""
 
 _PLACES, _MARGIN, _SAMPLES = 96, 8, 1500
+_REGION = 40
 
 P = TypeVar("P", bound=PatternScan)
 
@@ -80,6 +81,12 @@ def leakage_of(radiometry: Radiometry, bench: Bench) -> float:
     if radiometry.leakage is not None:
         return radiometry.leakage
     return float((bench.calibration or {}).get("leakage", 0.0))
+
+
+@lru_cache(maxsize=128)
+def _drawn(pattern: AnyPattern, side: int) -> NDArray[np.uint8]:
+    """A pattern as it is shown: for many blurs, and for the next scan."""
+    return patterns.render(pattern, side, side)
 
 
 class PatternMethod(Method[P]):
@@ -214,15 +221,24 @@ class PatternMethod(Method[P]):
         """Levels of the pattern set, 0 to 1, at places all over it under a projector's blur (px):
         (patterns, places)."""
         side = _PLACES + 2 * _MARGIN
-        rng = np.random.default_rng(0)
-        rows, columns = rng.integers(_MARGIN, side - _MARGIN, (2, _SAMPLES))
-        found = np.empty((len(self._patterns), _SAMPLES), dtype=np.float32)
+        whole = _REGION // self.period * self.period
+        if whole:  # each place of the period equally often
+            rows, columns = _MARGIN + np.indices((whole, whole)).reshape(2, -1)
+        else:
+            rng = np.random.default_rng(0)
+            rows, columns = rng.integers(_MARGIN, side - _MARGIN, (2, _SAMPLES))
+        found = np.empty((len(self._patterns), rows.size), dtype=np.float32)
         for index, pattern in enumerate(self._patterns):
-            image = patterns.render(pattern, side, side).astype(np.float32) / patterns.LEVELS
+            image = _drawn(pattern, side).astype(np.float32) / patterns.LEVELS
             if blur:
                 image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), dtype=np.float32)
             found[index] = image[rows, columns]
         return found
+
+    @property
+    def period(self) -> int:
+        """Of the pattern set, in projector pixels along both axes; more than any: it has none."""
+        return _REGION + 1
 
     def planned(self) -> int:
         """Frames of the whole plan."""
@@ -296,8 +312,10 @@ class RankedMethod(PatternMethod[P]):
 
     estimators = ("topk", "maxmin", "maxmin-unbiased")
 
-    even_nearby: ClassVar[bool] = True
-    """Whether each pattern lights as much of any neighbourhood."""
+    @property
+    def grid(self) -> tuple[int, int] | None:
+        """The shape of the grid that the patterns are shifts over, row by row; None: no order."""
+        return None
 
     def weights(self) -> NDArray[np.complex128] | None:
         """What tells the pattern's place at a pixel: see `handedness.WaveSums`. None: nothing."""
@@ -313,24 +331,16 @@ class RankedMethod(PatternMethod[P]):
                 f"topk ranks {2 * KEEP} patterns at least; take maxmin for {len(self._patterns)}",
                 "$.estimator",
             )
-        if name.startswith("maxmin") or few:
-            known = len(self._patterns) >= 2 * RANKS
-            return MaxMin(
-                response,
-                lit_fraction=self.lit_fraction,
-                leakage=self.leakage,
-                average=average,
-                levels=self.levels,
-                weights=self.weights(),
-                even=self.even_nearby,
-                unbiased=name == "maxmin-unbiased" or (name == "auto" and known),
-            )
-        return TopK(
+        ranked = not (few or name.startswith("maxmin"))
+        known = len(self._patterns) >= 2 * RANKS
+        return Extremes(
             response,
             lit_fraction=self.lit_fraction,
             leakage=self.leakage,
-            levels=self.levels,
+            keep=KEEP if ranked else 1,
+            unbiased=ranked or name == "maxmin-unbiased" or (name == "auto" and known),
             average=average,
+            levels=self.levels,
+            shifts=self.grid,
             weights=self.weights(),
-            even=self.even_nearby,
         )

@@ -18,7 +18,6 @@ class RandomBinaryMethod(RankedMethod[RandomBinary]):
     """Images in which patches are lit at random, each in the same number of them."""
 
     name: ClassVar[str] = "random-binary"
-    even_nearby: ClassVar[bool] = False
 
     def __init__(self, spec: RandomBinary, bench: Bench) -> None:
         alpha = 0.5 if spec.lit_fraction is None else spec.lit_fraction

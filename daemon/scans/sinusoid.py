@@ -103,6 +103,7 @@ class RandomPhaseMethod(PatternMethod[RandomPhase]):
             response,
             phases=[(0, phase) for phase in _phases(self.spec.phases)],
             leakage=self.leakage,
+            patches=True,
         )
 
 

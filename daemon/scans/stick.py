@@ -35,7 +35,11 @@ class StickMethod(OccluderMethod[Stick]):
         """See `Method`."""
         return Steadied(
             self.response,
-            lambda: Occluder(self.response, lit_fraction=self.spec.lit_fraction),
+            lambda: Occluder(
+                self.response,
+                lit_fraction=self.spec.lit_fraction,
+                averaged=self.spec.estimator == "auto",
+            ),
             few=True,
         )
 

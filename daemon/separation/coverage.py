@@ -1,5 +1,9 @@
 """Separation under a moving occluder, and whether its shadow ever reached a pixel (§4.2).
 
+A pixel is in full light for most of a sweep, so that its level there is a mean of many frames: the
+brightest of them is noise, or an edge that a shaken camera brought there. In the umbra it may have
+been once.
+
 L_max and L_min say nothing of a pixel that the shadow never crossed: its minimum is its own noise,
 and direct = 0 would be a lie. The frames tell it from a pixel that the source never reaches, whose
 direct light *is* 0:
@@ -44,7 +48,16 @@ LEAST_SHARE = 0.15
 DARKEST, BRIGHTEST = 4, 2
 """Samples kept a pixel: enough to tell one frame in the umbra from several."""
 
+LIT = 0.25
+"""A sample that has lost less, of what a pixel lost at its darkest, is taken for lit: a frame or
+two of penumbra among many ..."""
+
+LIT_DEVIATIONS = 5.0
+"""... or that noise may have made so."""
+
 _TINY = np.float32(1e-6)
+_LIMITED = 8  # frames after which it is asked again what is lit
+_MOST = 65_535  # samples that are averaged
 _SAMPLE = 4  # noise is measured on every fourth row and column
 
 
@@ -53,11 +66,13 @@ class Occluder:
 
     L_max = L_d + g L_g and L_min = g L_g with g the part of the source that the occluder leaves
     (a stick: 1), b = 0 in the umbra. `planes["coverage"]` (uint16) counts the frames near a pixel's
-    minimum, up to `DARKEST`; 0 where it was never unlit.
+    minimum, up to `DARKEST`; 0 where it was never unlit. `averaged` takes the means of the samples
+    in full light and in the umbra, without it the brightest and the darkest (the paper's).
     """
 
-    def __init__(self, response: Response, *, lit_fraction: float) -> None:
+    def __init__(self, response: Response, *, lit_fraction: float, averaged: bool = True) -> None:
         self._response = response
+        self._averaged = averaged
         self._alpha = lit_fraction
         self._references = References(response)
         self._unused = 0
@@ -66,6 +81,8 @@ class Occluder:
     def _begin(self) -> None:
         self._low = Ranked(DARKEST, largest=False)
         self._high = Ranked(BRIGHTEST, largest=True)
+        self._lit = _Lit()
+        self._table: Plane | None = None  # deviation of a sample, by counts
         self._cell_low: Plane | None = None
         self._cell_high: Plane | None = None
         self._pixel_noise = TemporalNoise(self._response.full_scale)
@@ -94,6 +111,10 @@ class Occluder:
             told = without(pixels, left_out, known)
             self._low.add(told)
             self._high.add(told)
+            frames = self._high.frames
+            if frames & (frames - 1) == 0 and (noise := self.noise()) is not None:
+                self._table = noise.deviation(np.arange(self._response.full_scale + 1))
+            self._lit.add(told, self._high.planes[1], self._low.planes[0], self._table)
             self._sweeping.add(pixels)
             self._watch(pixels, observation.warp is not None)
 
@@ -127,15 +148,22 @@ class Occluder:
             raise NotYet(f"an occluder's sweep needs 2 frames, {frames} came so far")
         low = self._response.linear(self._low.planes)
         high = self._response.linear(self._high.planes)
-        brightest, darkest = high[0], low[0]
         pixel_noise = self.noise()
         deviation = self._response.deviation(pixel_noise, self._high.planes[0])
         cells = self._cells(frames)
         seen = self._seen(low, high, deviation, frames, cells)
-        never = _never_unlit(seen, brightest, deviation, frames, cells)
+        never = _never_unlit(seen, high[0], deviation, frames, cells)
         coverage = _near_minimum(low, high, deviation)
         single = ~never & seen & (coverage == 1)
         coverage[never] = 0
+        brightest, darkest = high[0], low[0]
+        judged = Judgement.of_extremes(deviation, frames)
+        if self._averaged:
+            brightest = self._response.linear_between(
+                self._lit.level(self._high.planes[1], self._low.planes[0], self._table)
+            )
+            darkest = _umbra(low, self._response.deviation(pixel_noise, self._low.planes[0]))
+            judged = _judgement(deviation, frames)
         ambient = self._references.mean(Lighting.AMBIENT)
         if ambient is not None:
             brightest, darkest = brightest - ambient, darkest - ambient
@@ -149,9 +177,9 @@ class Occluder:
             saturated=self._high.planes[0] >= self._response.saturated_from,
             flags=bits(never, Quality.NEVER_UNLIT) | bits(single, Quality.SINGLE),
             planes={"coverage": coverage},
-            judgement=Judgement.of_extremes(deviation, frames),
+            judgement=judged,
             facts={
-                "estimator": "maxmin",
+                "estimator": "plateau" if self._averaged else "maxmin",
                 "frames": frames,
                 "unused_frames": self._unused,
                 "lit_fraction": self._alpha,
@@ -207,6 +235,54 @@ class Occluder:
             "covered": covered,
             "coverage": coverage,
         }
+
+
+class _Lit:
+    """The mean of a pixel's samples in full light: three planes.
+
+    Lit are those above a limit near the second brightest so far. It is looked at anew now and then:
+    an old one is too high for nothing but noise. Where the brightest have left the mean behind (the
+    first frames had the shadow there) it begins again.
+    """
+
+    def __init__(self) -> None:
+        self._frames = 0
+        self._sum = np.zeros(0, np.uint32)
+        self._count = np.zeros(0, np.uint16)
+        self._least: NDArray[Any] = np.zeros(0, np.uint8)
+
+    def add(
+        self, samples: NDArray[Any], edge: NDArray[Any], darkest: NDArray[Any], table: Plane | None
+    ) -> None:
+        """Take in a frame; `edge` is the second brightest sample of each pixel, `darkest` the
+        darkest, this frame's among them; `table` the deviation of noise by counts."""
+        if not self._frames:
+            self._sum = np.zeros(samples.shape, np.uint32)
+            self._count = np.zeros(samples.shape, np.uint16)
+        if self._frames < _LIMITED or self._frames % _LIMITED == 0:
+            self._least = _least_lit(edge, darkest, table)
+            left = self._sum < self._least.astype(np.uint32) * self._count
+            self._sum[left], self._count[left] = 0, 0
+        lit = (samples >= self._least) & (self._count < _MOST)
+        self._sum += samples * lit
+        self._count += lit
+        self._frames += 1
+
+    def level(self, edge: NDArray[Any], darkest: NDArray[Any], table: Plane | None) -> Plane:
+        """The mean, float32 counts: the second brightest sample where none was lit."""
+        mean = self._sum / np.maximum(self._count, 1).astype(np.float32)
+        behind = (self._count == 0) | (mean < _least_lit(edge, darkest, table))
+        return np.where(behind, edge, mean).astype(np.float32)
+
+
+def _least_lit(edge: NDArray[Any], darkest: NDArray[Any], table: Plane | None) -> NDArray[Any]:
+    """The least sample of each pixel that is taken for lit, in the samples' type."""
+    brightest = edge.astype(np.float32)
+    width = np.float32(LIT) * (brightest - darkest)
+    if table is not None:
+        np.maximum(width, np.float32(LIT_DEVIATIONS) * np.take(table, edge), out=width)
+    least: NDArray[Any] = np.ceil(np.maximum(brightest - width, 0)).astype(edge.dtype)
+    return least
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,6 +349,19 @@ def _near_minimum(low: Plane, high: Plane, deviation: Plane) -> NDArray[np.uint1
     )
     near = [_grey(plane) - darkest <= tolerance for plane in low]
     return np.asarray(np.count_nonzero(near, axis=0), dtype=np.uint16)
+
+
+def _umbra(low: Plane, deviation: Plane) -> Plane:
+    """The mean of the kept darkest samples (n, ...) that noise alone may part from the darkest."""
+    near = low - low[0] <= np.float32(2.0 * 2.0**0.5) * deviation
+    return np.asarray(np.sum(low * near, axis=0) / np.count_nonzero(near, axis=0), np.float32)
+
+
+def _judgement(deviation: Plane, frames: int) -> Judgement:
+    """Of a pixel that nothing happens to, noise makes the darkest of so many samples by half of the
+    range darker than the mean."""
+    limit = np.float32(noise_range(frames) / 2 + 2.0) * deviation
+    return Judgement(limit, limit, deviation)
 
 
 def _cells(pixels: NDArray[Any]) -> Plane:

@@ -48,7 +48,7 @@ class Quality(enum.IntFlag):
 
     SATURATED = 1 << 0  # a sample at the end of the camera's scale: components are too small
     DARK = 1 << 1  # not told from no light at all
-    LOW_MODULATION = 1 << 2  # direct not told from noise, or at an edge of two images
+    LOW_MODULATION = 1 << 2  # direct not told from noise
     NEVER_LIT = 1 << 3  # no frame with the source in full: direct is not known (NaN)
     NEVER_UNLIT = 1 << 4  # no frame in shadow: direct and global cannot be told apart (NaN)
     NEGATIVE = 1 << 5  # a component below zero by more than noise
@@ -56,6 +56,7 @@ class Quality(enum.IntFlag):
     DISAGREE = 1 << 7  # frequencies give different components
     MOVED = 1 << 8  # the scene, the camera or the source changed between frames
     SINGLE = 1 << 9  # one extreme rests on a single frame: noise, or a fleck, passes for light
+    EDGE = 1 << 10  # at an edge of the pattern: its light is split as its neighbours' is
 
 
 @dataclass(frozen=True, slots=True)

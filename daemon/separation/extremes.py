@@ -1,7 +1,10 @@
-"""Separation by the brightest and the darkest sample of each pixel: the paper's own (§3.3, §4.1).
+"""Separation by each pixel's brightest and darkest samples: the paper's own (§3.3, §4.1), and less
+what noise and blur do to them.
 
 Samples are compared in the camera's own type, where nothing wraps and nothing is converted; light
-is computed once, at the result. An update is one in-place maximum and one minimum.
+is computed once, at the result. The brightest of n samples is too bright by its own noise (2.7 σ
+too much direct light with 25 patterns), the mean of several less so, and what is left, with what
+blur takes away, is known from the pattern set (`order_estimate`).
 """
 
 from __future__ import annotations
@@ -14,24 +17,29 @@ from numpy.typing import NDArray
 
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
-from daemon.separation.finish import Judgement, bits, finish
+from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import WaveSums
-from daemon.separation.order_estimate import Explained, Followed, OrderStatistics, estimate
+from daemon.separation.order import Ranked
+from daemon.separation.order_estimate import Estimated, OrderStatistics
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
-from daemon.separation.residue import NOT_SHIFTS, of_shifts
-from daemon.separation.scan_noise import ScanNoise
+from daemon.separation.residue import NOT_SHIFTS, Mirrors, of_shifts
+from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import HALF, compare
 
 
-class MaxMin:
-    """L_max and L_min over patterns of one lit fraction -> direct, global (Eq. 8).
+class Extremes:
+    """Lit and unlit light over patterns of one lit fraction -> direct, global (Eq. 8).
 
-    With `average` > 1 the frames of each pattern are averaged in linear light before they are
-    compared; a pattern counts once its last frame is in. `levels` and `even` are as for `TopK`:
-    with them there are the planes `direct_std` and `global_std`, and the bias of noise and of blur
-    is stated; it is taken off only if `unbiased`. With `weights` (of `handedness.WaveSums`) a
-    mirror is found.
+    Of each pixel the `keep` brightest and darkest samples are kept: 1 for max/min, at one in-place
+    maximum and one minimum a frame, else 2 `keep` - 1 of each. With `levels` and `shifts` (of
+    `OrderStatistics`) there are the planes `direct_std` and `global_std`, and the bias of noise and
+    blur is stated; it is taken off if `unbiased`. With `average` > 1 the frames of each pattern are
+    averaged in linear light before they are compared; a pattern counts once its last frame is in.
+    With `weights` (of `handedness.WaveSums`: 4 products and sums a frame) a mirror is found.
+
+    What the last patterns change little, the noise and the mirrors, is looked at while they come,
+    so that the result is ready soon after the last.
     """
 
     def __init__(
@@ -40,67 +48,55 @@ class MaxMin:
         *,
         lit_fraction: float,
         leakage: float,
+        keep: int = 1,
+        unbiased: bool = False,
         average: int = 1,
         levels: Callable[[float], Plane] | None = None,
+        shifts: tuple[int, int] | None = None,
         weights: NDArray[np.complex128] | None = None,
-        even: bool = True,
-        unbiased: bool = False,
     ) -> None:
-        if unbiased and levels is None:
+        if (unbiased or keep > 1) and levels is None:
             raise ValueError("the bias of noise follows from the levels of the pattern set")
-        self._waves = None if weights is None else WaveSums(weights)
-        self._order = None if levels is None else OrderStatistics(levels, even)
-        self._followed = None if self._order is None else Followed(self._order.keep)
-        self._unbiased = unbiased
-        self._average_of = average
         self._response = response
         self._alpha = lit_fraction
         self._leakage = leakage
+        self._unbiased = unbiased
+        self._low = Ranked(keep, largest=False)
+        self._high = Ranked(keep, largest=True)
+        self._waves = None if weights is None else WaveSums(weights)
+        self._order = None if levels is None else OrderStatistics(levels, response, average, shifts)
         self._references = References(response)
-        self._mean = FrameMean(response) if average > 1 else None
         self._noise = ScanNoise(response, average)
+        self._mean = FrameMean(response) if average > 1 else None
         self._open: int | None = None  # the pattern being averaged
-        self._max: NDArray[Any] | None = None
-        self._min: NDArray[Any] | None = None
         self._saturated: NDArray[np.bool_] | None = None  # of averaged frames; else the max tells
-        self._patterns = 0
+        self._mirrors: Mirrors | None = None
         self._unused = 0
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Estimator`. Raises ValueError for an observation that comparing cannot respect."""
         if observation.strength != 1.0 or observation.warp is not None:
-            raise ValueError("max/min compares frames as they are: no warp, strength 1")
-        if observation.lighting is not Lighting.PATTERN:
-            if observation.used:
-                self._references.add(pixels, observation.lighting)
-                self._noise.add_reference(pixels, observation.lighting)
-            else:
-                self._unused += 1
-            return
-        if self._mean is None:
-            if observation.used:
-                if self._max is None:
-                    self._noise.add(pixels, observation.pattern)
-                self._compare(pixels, observation.pattern)
-            else:
-                self._unused += 1
-            return
-        self._average(self._mean, pixels, observation)
-
-    def _average(self, mean: FrameMean, pixels: NDArray[Any], observation: Observation) -> None:
-        if self._open is not None and self._open != observation.pattern:
-            self._close(mean)
-        self._open = observation.pattern
-        if observation.used:
-            mean.add(pixels)
-            self._noise.add(pixels, observation.pattern)
-            if self._saturated is None:
-                self._saturated = np.zeros(pixels.shape, dtype=np.bool_)
-            self._saturated |= pixels >= self._response.saturated_from
-        else:
+            raise ValueError("frames are compared as they are: no warp, strength 1")
+        if not observation.used:
             self._unused += 1
-        if observation.last:
-            self._close(mean)
+        elif observation.lighting is not Lighting.PATTERN:
+            self._references.add(pixels, observation.lighting)
+            self._noise.add_reference(pixels, observation.lighting)
+            return
+        elif self._mean is None:
+            if self._low.frames == 0:
+                self._noise.add(pixels, observation.pattern)
+            self._compare(pixels, observation.pattern)
+        else:
+            if self._open is not None and self._open != observation.pattern:
+                self._close(self._mean)
+            self._open = observation.pattern
+            self._mean.add(pixels)
+            self._noise.add(pixels, observation.pattern)
+            clipped = pixels >= self._response.saturated_from
+            self._saturated = clipped if self._saturated is None else self._saturated | clipped
+        if self._mean is not None and observation.last:
+            self._close(self._mean)
 
     def _close(self, mean: FrameMean) -> None:
         if mean.frames and self._open is not None:
@@ -109,92 +105,130 @@ class MaxMin:
         self._open = None
 
     def _compare(self, samples: NDArray[Any], pattern: int) -> None:
-        if self._waves is not None:
+        self._low.add(samples)
+        self._high.add(samples)
+        if self._order is not None:
+            self._order.add(samples, pattern)
+        if self._waves is not None and self._mirrors is None:
             self._waves.add(samples, pattern)
-        if self._max is None or self._min is None:
-            self._max, self._min = samples.copy(), samples.copy()
-        else:
-            np.maximum(self._max, samples, out=self._max)
-            np.minimum(self._min, samples, out=self._min)
-        if self._followed is not None:
-            self._followed.add(samples)
-        self._patterns += 1
+            if self._waves.complete:
+                if self._order is not None:
+                    self._order.look()
+                self._mirrors = self._mirrored()
+                self._waves = None
+
+    def _told(self) -> Told:
+        return self._noise.told() if self._order is None else self._order.told(self._noise)
+
+    def _mirrored(self) -> Mirrors:
+        """Where the pattern came by way of a mirror, by what is known of noise."""
+        told = self._told()
+        ends = (self._light(ranked.planes[-1]) for ranked in (self._low, self._high))
+        squares = (np.square(told.deviation(end)) for end in ends)
+        return of_shifts(self._waves, np.sqrt(sum(squares) * np.float32(0.5)))
 
     def result(self) -> Components:
-        """See `Estimator`. Raises NotYet before two patterns are in."""
-        if self._max is None or self._min is None or self._patterns < 2:
-            raise NotYet(f"max/min needs 2 patterns, {self._patterns} came so far")
-        brightest, darkest = self._light(self._max), self._light(self._min)
-        saturated = self._saturated
-        if saturated is None:
-            saturated = self._max >= self._response.saturated_from
-        explained = self._explained()
-        told = self._noise.told() if explained is None else explained.told
-        deviation, b = told.deviation(brightest), self._leakage
-        g = light_model.global_weight(self._alpha, b)
-        lit, unlit = brightest, darkest
-        planes: dict[str, NDArray[Any]] = {}
-        found: dict[str, Any] = {}
-        if explained is not None:
-            low, high = darkest[None], brightest[None]
-            dark, deviation = explained.deviations(low, high)
-            ends = estimate(explained.model, low, high, dark, deviation, k=1)
-            direct_var, global_var = ends.variances(b, g, explained.uneven)
-            reference = self._references.ambient_variance(told)
-            if reference is not None:
-                global_var += reference * np.float32(g**-2)
-            planes = {"direct_std": np.sqrt(direct_var), "global_std": np.sqrt(global_var)}
-            found = {"blur_px": explained.blur, **explained.systematic(ends, deviation, b, g, k=1)}
-            if self._unbiased:
-                lit, unlit = ends.lit, ends.unlit
+        """See `Estimator`. Raises NotYet before two patterns are in; with fewer than two for each
+        sample that is kept, the brightest and the darkest are taken as they are."""
+        patterns = self._low.frames
+        if patterns < 2:
+            raise NotYet(f"the brightest and the darkest take 2 patterns, {patterns} came so far")
+        low, high = self._light(self._low.planes), self._light(self._high.planes)
+        told = self._told()
+        found = None
+        if self._order is not None and patterns >= 2 * self._low.keep:
+            found = self._order.estimate(low, high, told)
+        deviation = told.deviation(high[0]) if found is None else found.deviation
+        unbiased = self._unbiased and found is not None
+        lit, unlit = (found.lit, found.unlit) if unbiased and found else (high[0], low[0])
+
+        b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
+        flags: NDArray[np.uint16] | None = None
+        steady: dict[str, Any] = {}
+        advice: list[str] = []
+        if abs(self._alpha - 0.5) < HALF:
+            middle = (lit + unlit) * np.float32(0.5)
+            flags, steady, advice = compare(self._references, middle, deviation, b, ranked=True)
         ambient, source = self._references.ambient(lit, unlit, self._alpha, b)
         if ambient is not None:
             lit, unlit = lit - ambient, unlit - ambient
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, b)
-        moved: NDArray[np.uint16] | None = None
-        steady: dict[str, Any] = {}
-        advice: list[str] = []
-        if abs(self._alpha - 0.5) < HALF:
-            middle = (brightest + darkest) * np.float32(0.5)
-            moved, steady, advice = compare(self._references, middle, deviation, b, ranked=True)
-        mirrored, looked, as_declared = of_shifts(self._waves, deviation)
-        flags = np.zeros(direct.shape[:2], dtype=np.uint16) if moved is None else moved
-        if mirrored is not None:
-            flags |= bits(mirrored, Quality.RESIDUE)
+        planes: dict[str, NDArray[Any]] = {}
+        judgement = Judgement.of_extremes(deviation, patterns)
+        stated: dict[str, Any] = {}
+        if found is not None:
+            direct_var, global_var = self._variances(found, told)
+            if unbiased:
+                source = self._better(told, direct, indirect, direct_var, global_var) or source
+            planes = {"direct_std": np.sqrt(direct_var), "global_std": np.sqrt(global_var)}
+            stated = {"blur_px": found.blur, **found.systematic(b, g, biased=not unbiased)}
+            if unbiased:
+                rounding = self._response.deviation(None, self._response.counts(high[0]))
+                direct_limit, total_limit = (
+                    np.float32(SIGNIFICANT) * np.maximum(plane, rounding)
+                    for plane in planes.values()
+                )
+                own = deviation * np.float32(1.0 / found.uneven)
+                judgement = Judgement(direct_limit, total_limit, own)
+        saturated = self._saturated
+        if saturated is None:
+            saturated = self._high.planes[0] >= self._response.saturated_from
+        mirrors = self._mirrors or of_shifts(None, deviation)
+        if mirrors.mask is not None:
+            mirror = bits(mirrors.mask, Quality.RESIDUE)
+            flags = mirror if flags is None else flags | mirror
+        name = "topk" if self._low.keep > 1 else "maxmin-unbiased" if self._unbiased else "maxmin"
         return finish(
             direct,
             indirect,
-            planes=planes,
             response=self._response,
-            brightest=brightest,
+            brightest=high[0],
             saturated=saturated,
             flags=flags,
-            judgement=Judgement.of_extremes(deviation, self._patterns),
+            judgement=judgement,
+            planes=planes,
             facts={
-                "estimator": "maxmin-unbiased" if self._unbiased else "maxmin",
-                "patterns": self._patterns,
+                "estimator": name,
+                "patterns": patterns,
                 "unused_frames": self._unused,
                 "lit_fraction": self._alpha,
                 "leakage": b,
                 **told.facts(),
-                **found,
-                **looked,
+                **stated,
+                **mirrors.facts,
                 **steady,
+                "advice": ([] if mirrors.as_declared else [NOT_SHIFTS]) + advice + told.advice(),
                 **self._references.facts(source),
-                "advice": ([] if as_declared else [NOT_SHIFTS]) + advice + told.advice(),
             },
         )
-
-    def _explained(self) -> Explained | None:
-        """Blur and noise; None where the levels of the pattern set are not known."""
-        if self._order is None or self._followed is None:
-            return None
-        low, high = (self._light(ranks) for ranks in self._followed.ranks())
-        return self._order.explain(low, high, self._noise, self._response, self._average_of)
 
     def _light(self, samples: NDArray[Any]) -> Plane:
         return self._response.linear(samples) if self._mean is None else samples
 
+    def _variances(self, found: Estimated, told: Told) -> tuple[Plane, Plane]:
+        """Of direct and of global light: of noise, that of the references included."""
+        g = light_model.global_weight(self._alpha, self._leakage)
+        direct, indirect = found.variances(self._leakage, g)
+        reference = self._references.ambient_variance(told)
+        if reference is not None:
+            indirect += reference * np.float32(g**-2)
+        return direct, indirect
+
+    def _better(
+        self, told: Told, direct: Plane, indirect: Plane, direct_var: Plane, global_var: Plane
+    ) -> str | None:
+        """Where a white frame less a black one tells global light with less noise than the darkest
+        samples less the black one, its light and its variance, in place; from what it is known."""
+        whole = self._references.whole(self._leakage)
+        clipped = self._references.white_saturated
+        if whole is None or clipped is None:
+            return None
+        alone = direct_var + self._references.whole_variance(told, self._leakage)
+        better = ~clipped & (alone < global_var)
+        np.copyto(indirect, whole.light - direct, where=better)
+        np.copyto(global_var, alone, where=better)
+        return whole.source
+
     def summary(self) -> dict[str, float]:
         """Patterns compared and frames not used."""
-        return {"patterns": float(self._patterns), "unused": float(self._unused)}
+        return {"patterns": float(self._low.frames), "unused": float(self._unused)}

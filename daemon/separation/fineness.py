@@ -10,11 +10,14 @@ it is all that a pair of images or random patterns tell of mirrors. A flat one s
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.handedness import Wave
+from daemon.separation.sampling import thinned
 
 Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -44,27 +47,26 @@ def finer_pattern(wave: Wave, strength: Plane, *, smooth: bool = False) -> Mask 
     at each pixel, of which the sign or the phase counts; `strength` (H, W): its amplitude in
     standard deviations of its noise.
     """
-    sign, noise, strong = _faded(wave, strength)
-    steps = [_steps(sign, noise, strong, axis) for axis in (1, 0)]
+    sign = _faded(wave, strength)
+    steps = [_steps(sign, axis) for axis in (1, 0)]
     if min(np.count_nonzero(both) for _, both in steps) < _ENOUGH:
         return None
     # a faded sign changes by less: by as much as its square
-    power = np.square(np.abs(sign)) - noise
-    rates = [float(change[both].sum() / power[both].sum()) for change, both in steps]
+    rates = [float(change.sum() / sign.power[both].sum()) for change, both in steps]
     if max(rates) > _RESOLVED or min(rates) <= 0.0:
         return None
     per_step = np.sqrt(min(rates)) if smooth else min(rates)
     size = int(np.clip(round(_PERIODS / per_step), _LEAST, _MOST)) | 1
     ratios = []
-    around = cv2.blur(power, (size, size))
+    around = np.maximum(cv2.blur(sign.power, (size, size)), np.float32(1e-3))
     for change, both in steps:
-        part = cv2.blur(both.astype(np.float32), (size, size))
-        local = cv2.blur(change, (size, size)) / np.maximum(around, np.float32(1e-3))
-        usable = both & (part > _FILLED)
-        if np.count_nonzero(usable) < _ENOUGH:
+        filled = cv2.blur(both.astype(np.float32), (size, size)) > np.float32(_FILLED)
+        local = cv2.blur(change, (size, size)) / around
+        usable = local[both & filled]
+        if usable.size < _ENOUGH:
             return None
-        typical = float(np.median(local[usable]))
-        ratios.append(np.where(part > _FILLED, local / np.float32(max(typical, 1e-3)), 0))
+        typical = float(np.median(thinned(usable)))
+        ratios.append(local * filled * np.float32(1.0 / max(typical, 1e-3)))
     # a step of a smooth wave grows with its frequency, and so does its square
     dense = np.minimum.reduce(ratios) > np.float32(FINER**2 if smooth else FINER)
     kernel = np.ones((size // 2 | 1,) * 2, np.uint8)
@@ -72,19 +74,20 @@ def finer_pattern(wave: Wave, strength: Plane, *, smooth: bool = False) -> Mask 
     return np.asarray(wide)
 
 
-def _steps(sign: Wave, noise: Plane, strong: Mask, axis: int) -> tuple[Plane, Mask]:
+def _steps(of: _Sign, axis: int) -> tuple[Plane, Mask]:
     """Half the squared change from each pixel to the next along an axis, and where both are strong;
     a frame's shape, the last row or column none."""
-    change = np.zeros(sign.shape, dtype=np.float32)
-    both = np.zeros(sign.shape, dtype=np.bool_)
-    here: list[slice] = [slice(None), slice(None)]
-    there: list[slice] = [slice(None), slice(None)]
-    here[axis], there[axis] = slice(None, -1), slice(1, None)
-    first, second = tuple(here), tuple(there)
-    both[first] = strong[first] & strong[second]
-    turned = np.abs(sign[second] - sign[first])
-    own = np.square(turned) - noise[first] - noise[second]
-    change[first] = np.where(both[first], own * np.float32(0.5), np.float32(0.0))
+    change = np.zeros(of.noise.shape, dtype=np.float32)
+    both = np.zeros(of.noise.shape, dtype=np.bool_)
+    first, second = (
+        (by, slice(None)) if axis == 0 else (slice(None), by)
+        for by in (slice(None, -1), slice(1, None))
+    )
+    both[first] = of.strong[first] & of.strong[second]
+    turned = -of.noise[first] - of.noise[second]
+    for part in of.parts:
+        turned += np.square(part[second] - part[first])
+    np.multiply(turned, both[first] * np.float32(0.5), out=change[first])
     return change, both
 
 
@@ -95,11 +98,11 @@ def astray(wave: Plane, strength: Plane, across: str) -> Mask | None:
     `wave` (H, W) from -1 unlit to 1 lit of stripes across the axis `across`, texture taken out;
     `strength` as for `finer_pattern`. Along a stripe, light changes slowly, however it is bent.
     """
-    sign, noise, strong = _faded(wave.astype(np.complex64), strength)
-    change, both = _steps(sign, noise, strong, 0 if across == "x" else 1)
+    sign = _faded(wave.astype(np.complex64), strength)
+    change, both = _steps(sign, 0 if across == "x" else 1)
     if np.count_nonzero(both) < _ENOUGH:
         return None
-    around = cv2.blur(np.square(np.abs(sign)) - noise, (_STRIPES, _STRIPES))
+    around = cv2.blur(sign.power, (_STRIPES, _STRIPES))
     local = cv2.blur(change, (_STRIPES, _STRIPES)) / np.maximum(around, np.float32(1e-3))
     part = cv2.blur(both.astype(np.float32), (_STRIPES, _STRIPES))
     if float(np.median(local[part > _FILLED])) > 0.5 * _ASTRAY:
@@ -109,16 +112,25 @@ def astray(wave: Plane, strength: Plane, across: str) -> Mask | None:
     return np.asarray(cv2.morphologyEx(found, cv2.MORPH_OPEN, kernel)) > 0
 
 
-def _faded(wave: Wave, strength: Plane) -> tuple[Wave, Plane, Mask]:
-    """The sign or phase of a wave, the noise in its square, and where it is strong.
+@dataclass(frozen=True, slots=True)
+class _Sign:
+    """The sign or phase of a wave, its real and imaginary part; the noise in its square, its square
+    without it, and where it is strong. It fades near 0, where noise would make it change to and
+    fro, and is 0 where it is not strong."""
 
-    It fades near 0, where noise would make it change to and fro.
-    """
-    length = np.abs(wave)
-    fading = np.maximum(np.hypot(length, length / np.maximum(strength, _TINY) * _FADE), _TINY)
-    sign = np.asarray(wave / fading, dtype=np.complex64)
+    parts: tuple[Plane, Plane]
+    noise: Plane
+    power: Plane
+    strong: Mask
+
+
+def _faded(wave: Wave, strength: Plane) -> _Sign:
     strong = np.asarray(cv2.blur(strength, (_AROUND, _AROUND))) > np.float32(_STRONG)
-    sign[~strong] = 0
+    real, imaginary = (np.ascontiguousarray(part) for part in (wave.real, wave.imag))
     squared = np.square(strength) + np.float32(_FADE**2)
-    noise: Plane = strong.astype(np.float32) * np.float32(_TRUSTED) / squared
-    return sign, noise, strong
+    share = strong.astype(np.float32) / squared
+    size = np.asarray(cv2.magnitude(real, imaginary), dtype=np.float32)
+    scale = np.sqrt(share) * strength / np.maximum(size, _TINY)
+    noise: Plane = share * np.float32(_TRUSTED)
+    power = share * np.square(strength) - noise
+    return _Sign((real * scale, imaginary * scale), noise, power, strong)

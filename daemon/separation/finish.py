@@ -12,6 +12,7 @@ from daemon.separation import mosaic
 from daemon.separation.estimator import Components, Quality
 from daemon.separation.noise import noise_range
 from daemon.separation.radiometry import Plane, Response
+from daemon.separation.sampling import thinned
 
 SIGNIFICANT = 3.0
 """How many standard deviations tell a component from noise."""
@@ -121,7 +122,7 @@ def finish(
             *_advice(counted),
             *_unusable(quality, counted, brightest, judgement, flags),
         ],
-        "noise_counts": round(float(np.nanmedian(judgement.deviation)), 4),
+        "noise_counts": round(float(np.nanmedian(thinned(judgement.deviation))), 4),
         "black_level": response.black,
         "tone": response.tone,
         "full_scale": response.full_scale,
@@ -199,7 +200,7 @@ def _unusable(
         return []
     nothing = Quality.DARK | Quality.LOW_MODULATION | Quality.NEVER_LIT | Quality.NEVER_UNLIT
     # By light and not by DARK: where noise is taken for more than it is, all is dark.
-    lit = _some(brightest > np.float32(_LIT) * np.quantile(brightest, 0.99))
+    lit = _some(brightest > np.float32(_LIT) * np.quantile(thinned(brightest), 0.99))
     lost = lit & (quality & np.uint16(nothing) != 0)
     count = int(np.count_nonzero(lost))
     part = count / max(int(np.count_nonzero(lit)), 1)

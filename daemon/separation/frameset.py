@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation, Result
+from daemon.separation.mosaic import orders_of
 from daemon.separation.radiometry import Plane, Response
 
 _SAMPLES = 20_000
@@ -30,6 +31,8 @@ _STEP_ERRORS = 5.0
 _UNEQUAL = 0.05  # of a pair's light, from pair to pair
 _SAME = 0.35  # of the usual difference of two frames in a row: below it they are one pattern
 _MOST_NAMED = 5
+_BRIGHT = {Lighting.WHITE, Lighting.PATTERN}
+_LOOK = 1024  # pixels a side that are looked at for a mosaic
 _DEPTHS = (10, 12, 14)  # bits that files of 16 hold
 _PILED = 1e-3  # of all samples, at the largest count of any: light is not so often the same
 
@@ -101,12 +104,15 @@ class FrameSet:
         self._last: tuple[int, Plane] | None = None
         self._steps: dict[tuple[int, int], float] = {}  # differences of frames in a row
         self._ceiling = Ceiling()
+        self._mosaic: tuple[str, ...] | None = None  # that the first frame looks like
 
     def add(self, pixels: NDArray[Any], observation: Observation) -> None:
         """Take in a frame that is used."""
         step = max(1, int(np.sqrt(pixels.shape[0] * pixels.shape[1] / _SAMPLES)) | 1)
         sample = np.ascontiguousarray(pixels[::step, ::step])
         self._ceiling.add(sample)
+        if self._mosaic is None and observation.lighting in _BRIGHT:
+            self._mosaic = orders_of(pixels[:_LOOK, :_LOOK]) if pixels.ndim == 2 else ()
         light = self._response.linear(sample)
         level = float(light.mean(dtype=np.float64))
         if observation.lighting is not Lighting.PATTERN:
@@ -132,6 +138,12 @@ class FrameSet:
     def told(self) -> tuple[dict[str, Any], list[str], list[str]]:
         """Facts, lines of advice, and what is to be said after all other advice."""
         lines = [*self._copied(), *self._swapped(), *self._ceiling.told(self._response)]
+        if self._mosaic and self._response.bayer not in self._mosaic:
+            other = f", and not {self._response.bayer}" if self._response.bayer else ""
+            lines.append(
+                f"the frames look like a colour mosaic's that begins {' or '.join(self._mosaic)}"
+                f"{other}: say so (--bayer)"
+            )
         last = [] if self._references else [UNCHECKED]
         facts: dict[str, Any] = {}
         if self._even and len(self._levels) >= 2:

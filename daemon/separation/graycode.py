@@ -3,7 +3,7 @@
 A bit's pattern P and inverse I light half of the source each, so that P + I = (1 + b)(L_d + L_g)
 at every pixel and |P - I| = (1 - b) L_d where the pixel sees one stripe alone. A pixel at the edge
 of a stripe, or one that the finest stripes' blur reaches, has less: of the stripes that are fine
-enough, the finest that keeps its contrast separates the pixel.
+enough, those that keep their contrast separate the pixel.
 """
 
 from __future__ import annotations
@@ -23,14 +23,10 @@ from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.scan_noise import ScanNoise
 from daemon.separation.steadiness import compare
+from daemon.separation.stripes import Resolved, resolved
 
 FINE = 4
 """Bits whose stripes count as high frequency: 2, 4, 8 and 16 px wide."""
-
-_KEPT = 0.95
-"""A stripe resolves a pixel that has at least this part of the best contrast."""
-
-
 _SEEN = 2
 """The bit by whose stripes, 8 px wide, a mirror's finer ones are told."""
 
@@ -141,9 +137,10 @@ class GrayCodeDecoder:
         b = self._leakage
         told = self._noise.told()
         deviation = told.deviation(self._brightest)
-        contrast, stripe = self._finest(deviation)
+        pair: Plane = self._whole * np.float32(1.0 / self._pairs)
+        fine = self._resolved(pair, deviation)
+        contrast, stripe = fine.contrast, fine.width
         direct = contrast * np.float32(1.0 / (1.0 - b))
-        pair = self._whole * np.float32(1.0 / self._pairs)
         half: Plane = pair * np.float32(0.5)
         total = self._references.total(half, b)
         moved, steady, advice = compare(self._references, half, deviation, b)
@@ -151,7 +148,11 @@ class GrayCodeDecoder:
         step = contrast * np.float32(0.5)
         pair_var = np.square(told.deviation(half + step))
         pair_var += np.square(told.deviation(half - step))
-        direct_std: Plane = np.sqrt(pair_var) * np.float32(1.0 / (1.0 - b))
+        count, spread = (
+            plane if pair_var.ndim == 2 else plane[..., None] for plane in (fine.count, fine.spread)
+        )
+        noise_std: Plane = np.sqrt(pair_var / count) * np.float32(1.0 / (1.0 - b))
+        direct_std: Plane = np.hypot(noise_std, spread * np.float32(1.0 / (1.0 - b)))
         global_var = total.of_references(told.deviation) * np.float32(self._average)
         global_var += pair_var * np.asarray(total.of_half * (0.25 / self._pairs), np.float32)
         global_std: Plane = np.sqrt(direct_std**2 + global_var)
@@ -169,6 +170,7 @@ class GrayCodeDecoder:
         )
         sums, unequal = self._sums.told(float(np.median(deviation)))
         flags = bits(mirrors.mirrored, Quality.RESIDUE)
+        flags |= bits(fine.disagree, Quality.DISAGREE)
         if moved is not None:
             flags |= moved
         return finish(
@@ -178,7 +180,7 @@ class GrayCodeDecoder:
             brightest=self._brightest,
             saturated=self._saturated,
             judgement=Judgement(
-                direct=np.float32(SIGNIFICANT) * direct_std,
+                direct=np.float32(SIGNIFICANT) * noise_std,
                 total=np.float32(SIGNIFICANT) * global_std,
                 deviation=deviation,
             ),
@@ -224,19 +226,10 @@ class GrayCodeDecoder:
             return None
         return found[0] if len(found) == 1 else np.sign(found[0]) * found[1]
 
-    def _finest(self, deviation: Plane) -> tuple[Plane, NDArray[np.uint16]]:
-        """|P - I| of the finest stripes that keep their contrast, and their width (H, W)."""
+    def _resolved(self, pair: Plane, deviation: Plane) -> Resolved:
         keys = sorted(self._difference, key=lambda key: key[1])
         contrasts = [np.abs(self._difference[key]) for key in keys]
-        greys = [_grey(contrast) for contrast in contrasts]
-        enough = np.maximum.reduce(greys) * np.float32(_KEPT) - np.float32(2.0) * _grey(deviation)
-        chosen = np.zeros_like(contrasts[0])
-        stripe = np.zeros(enough.shape, dtype=np.uint16)
-        for key, contrast, grey in zip(keys, contrasts, greys, strict=True):
-            take = (stripe == 0) & (grey >= enough)
-            chosen[take] = contrast[take]
-            stripe[take] = 2 ** (key[1] + 1)
-        return chosen, stripe
+        return resolved(contrasts, [2 ** (bit + 1) for _, bit in keys], pair, deviation)
 
     def summary(self) -> dict[str, float]:
         """Pairs that are in, and frames not used."""

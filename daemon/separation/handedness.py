@@ -11,12 +11,14 @@ below a surface leave where it is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from daemon.separation.sampling import thinned
 
 Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -35,13 +37,15 @@ class WaveSums:
     """Σ w_i I_i for each of a few weights a pattern: constant memory, the camera's counts.
 
     `weights` (patterns, waves) complex, of mean 0 over the patterns, so that light which is in all
-    of them cancels. A sum tells nothing before each pattern came once.
+    of them cancels; patterns of weight 0 are not needed. A sum tells nothing before each of the
+    others came once.
     """
 
     def __init__(self, weights: NDArray[np.complex128]) -> None:
         self._weights = weights
         self._sums: list[tuple[Plane, Plane]] = []
         self._buffer: Plane | None = None
+        self._missing = {int(n) for n in np.flatnonzero(np.any(weights != 0, axis=1))}
         self._seen: set[int] = set()
         self._broken = False
 
@@ -50,19 +54,27 @@ class WaveSums:
         if pattern in self._seen or pattern >= len(self._weights):
             self._broken = True
             return
+        self._seen.add(pattern)
+        if pattern not in self._missing:
+            return
+        self._missing.discard(pattern)
         values = samples.astype(np.float32)
         if self._buffer is None:
             self._buffer = np.empty_like(values)
             self._sums = [(np.zeros_like(values), np.zeros_like(values)) for _ in self._weights[0]]
-        self._seen.add(pattern)
         for weight, parts in zip(self._weights[pattern], self._sums, strict=True):
             for factor, plane in zip((weight.real, weight.imag), parts, strict=True):
                 np.multiply(values, np.float32(factor), out=self._buffer)
                 np.add(plane, self._buffer, out=plane)
 
+    @property
+    def complete(self) -> bool:
+        """Whether all patterns that are needed came, each once."""
+        return not (self._broken or self._missing)
+
     def waves(self) -> list[Wave] | None:
-        """The waves (H, W), colours added up; None while a pattern is missing."""
-        if self._broken or len(self._seen) < len(self._weights):
+        """The waves (H, W), colours added up; None unless `complete`."""
+        if not self.complete:
             return None
         return [_grey(np.asarray(real + 1j * imaginary)) for real, imaginary in self._sums]
 
@@ -76,20 +88,27 @@ def shift_weights(
     shifts: Sequence[tuple[int, int]], period: float
 ) -> NDArray[np.complex128] | None:
     """Weights of `WaveSums` for shifts (x, y) over a whole grid of a pattern of one period each
-    way: waves of phase x + y and x - y. None where the shifts don't tell a wave's phase."""
-    along = []
-    for axis in range(2):
-        offsets = sorted({shift[axis] for shift in shifts})
-        turn = 2.0 * np.pi * np.asarray(offsets) / period
-        design = np.stack([np.ones_like(turn), np.cos(turn), np.sin(turn)])
-        normal = design @ design.T
-        if np.linalg.cond(normal) > 100.0:
-            return None
-        dual = np.linalg.solve(normal, design)
-        along.append(dict(zip(offsets, dual[1] + 1j * dual[2], strict=True)))
-    x = np.asarray([along[0][shift[0]] for shift in shifts])
-    y = np.asarray([along[1][shift[1]] for shift in shifts])
+    way: waves of phase x + y and x - y. The last row's are 0 where the rows before it tell them.
+    None where the shifts don't tell a wave's phase."""
+    columns, rows = (sorted({shift[axis] for shift in shifts}) for axis in range(2))
+    along = _duals(columns, period)
+    across = _duals(rows[:-1], period) or _duals(rows, period)
+    if along is None or across is None:
+        return None
+    x = np.asarray([along[shift[0]] for shift in shifts])
+    y = np.asarray([across.get(shift[1], 0j) for shift in shifts])
     return np.stack([x * y, x * np.conj(y)], axis=1)
+
+
+def _duals(offsets: list[int], period: float) -> dict[int, complex] | None:
+    """By offset, the weights that give a wave's complex amplitude; None where they cannot."""
+    turn = 2.0 * np.pi * np.asarray(offsets) / period
+    design = np.stack([np.ones_like(turn), np.cos(turn), np.sin(turn)])
+    normal = design @ design.T
+    if np.linalg.cond(normal) > 100.0:
+        return None
+    dual = np.linalg.solve(normal, design)
+    return dict(zip(offsets, dual[1] + 1j * dual[2], strict=True))
 
 
 def strength(waves: Sequence[Wave], deviation: Plane) -> Plane:
@@ -107,9 +126,10 @@ def imbalance(waves: Sequence[Wave], strength: Plane) -> float | None:
     None where hardly any pixel is modulated.
     """
     strong = strength > np.float32(STRONG)
-    if len(waves) != 2 or np.count_nonzero(strong) < _WINDOW**2:
+    if len(waves) != 2 or np.count_nonzero(thinned(strong)) < _WINDOW**2:
         return None
-    first, second = (np.abs(wave)[strong] for wave in waves)
+    some = thinned(strong)
+    first, second = (np.abs(thinned(wave)[some]) for wave in waves)
     return float(np.median(np.abs(first - second) / (first + second)))
 
 
@@ -121,12 +141,11 @@ def reversed_pattern(waves: Sequence[Wave], strength: Plane) -> Mask:
     standard deviations of its noise. Nothing is found where no way round prevails.
     """
     strong = strength > np.float32(STRONG)
-    slopes = [_slope(wave, strong, axis) for wave in waves for axis in (1, 0)]
-    coherent = np.minimum.reduce([np.abs(slope) for slope in slopes]) > _COHERENT
-    usable = strong & coherent
+    slopes = [slope for wave in waves for slope in _slopes(wave, strong)]
+    usable = strong & np.logical_and.reduce([size > np.float32(_COHERENT) for _, size in slopes])
     if np.count_nonzero(usable) < _WINDOW**2:
         return np.zeros(strength.shape, dtype=np.bool_)
-    angles = [np.angle(slope) for slope in slopes]
+    angles = [angle for angle, _ in slopes]
     if len(waves) == 2:
         turn = angles[0] * angles[3] - angles[1] * angles[2]
     else:
@@ -144,27 +163,35 @@ def reversed_pattern(waves: Sequence[Wave], strength: Plane) -> Mask:
     # around it the mirror's images are too fine for a slope: what is joined to it without one
     loose = found | (strong & ~(usable & ~against))
     _, pieces = cv2.connectedComponents(loose.astype(np.uint8))
-    joined = np.isin(pieces, np.unique(pieces[found]))
-    return np.asarray(joined & _morphed(found, cv2.MORPH_DILATE, _REACH))
+    joined = np.zeros(int(pieces.max()) + 1, dtype=np.bool_)
+    joined[pieces[found]] = True
+    return np.asarray(joined[pieces] & _morphed(found, cv2.MORPH_DILATE, _REACH))
 
 
-def _slope(wave: Wave, strong: Mask, axis: int) -> Wave:
-    """The mean of the phase's steps along an axis, as a number of length 0 (they differ) to 1."""
-    length = np.abs(wave)
-    sign = wave / np.maximum(length, np.float32(1e-9))
-    sign[~strong] = 0
-    step = np.zeros_like(sign)
-    here: list[slice] = [slice(None), slice(None)]
-    there: list[slice] = [slice(None), slice(None)]
-    here[axis], there[axis] = slice(None, -1), slice(1, None)
-    step[tuple(here)] = sign[tuple(there)] * np.conj(sign[tuple(here)])
+def _slopes(wave: Wave, strong: Mask) -> Iterator[tuple[Plane, Plane]]:
+    """Along x and along y: the phase's step from pixel to pixel, the mean of a window, and the
+    length of that mean, 0 (they differ) to 1."""
+    real, imaginary = (np.ascontiguousarray(part) for part in (wave.real, wave.imag))
+    size = np.asarray(cv2.magnitude(real, imaginary), dtype=np.float32)
+    scale = strong.astype(np.float32) / np.maximum(size, np.float32(1e-9))
+    real, imaginary = (np.asarray(part * scale, dtype=np.float32) for part in (real, imaginary))
     window = (_WINDOW, _WINDOW)
-    real, imaginary = (
-        cv2.blur(np.ascontiguousarray(part), window) for part in (step.real, step.imag)
-    )
-    weight = cv2.blur(np.abs(step), window)
-    total = np.asarray(real + 1j * imaginary, dtype=np.complex64)
-    return np.asarray(total / np.maximum(weight, np.float32(1e-3)), dtype=np.complex64)
+    for axis in (1, 0):
+        here, there = (_shifted(axis, by) for by in (slice(None, -1), slice(1, None)))
+        a, b, c, d = real[here], imaginary[here], real[there], imaginary[there]
+        steps = (a * c + b * d, a * d - b * c, (strong[here] & strong[there]).astype(np.float32))
+        edge = (0, 1, 0, 0) if axis == 0 else (0, 0, 0, 1)  # the last row or column has none
+        along, turned, weight = (
+            cv2.blur(cv2.copyMakeBorder(step, *edge, cv2.BORDER_CONSTANT), window) for step in steps
+        )
+        angle = np.asarray(cv2.phase(along, turned), dtype=np.float32)  # 0 to 2π
+        angle -= (angle > np.float32(np.pi)) * np.float32(2.0 * np.pi)
+        length = cv2.magnitude(along, turned) / np.maximum(weight, np.float32(1e-3))
+        yield angle, np.asarray(length, dtype=np.float32)
+
+
+def _shifted(axis: int, by: slice) -> tuple[slice, slice]:
+    return (by, slice(None)) if axis == 0 else (slice(None), by)
 
 
 def _morphed(mask: Mask, how: int, size: int) -> Mask:

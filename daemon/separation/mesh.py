@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
-from daemon.separation.noise import Noise, TemporalNoise
-from daemon.separation.plateau import BAND, WHOLE, Part, Plateaus
+from daemon.separation.noise import Noise
+from daemon.separation.plateau import BAND, WHOLE, Part, Plateaus, spread
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
+from daemon.separation.still import StillPlaces
 from daemon.separation.warping import without
 
 LEAST_MODULATION = 0.05
@@ -39,19 +40,22 @@ LEAST_FRAMES = 2
 _SAMPLE = 4  # noise is measured on every fourth row and column
 _FOLLOWED = 40_000  # pixels on which coverage is followed
 _EVERY = 4  # frames from one look at coverage to the next
-_STILL = 0.2  # part of the picture that the mesh's shadow leaves as it was from frame to frame
-_PULLED = 0.03  # of direct: noise that pulls by more is worth a line of advice
+_PULLED = 0.05  # of direct: noise that pulls by more is worth a line of advice
+_UNLIKE = (
+    0.3  # of β: a mesh that is another one, or no mesh, lights places for so much more or less
+)
+_TELLING = 0.2  # of a place's light, that comes and goes with the mesh
 _FINEST, _COARSEST = 5.0, 201.0  # pitches in pixels that are believed
 
 
 class MeshOccluder:
     """Frames of a scene behind a moving mesh -> direct, global, coverage.
 
-    `hole_fraction` is β; None: it is measured, for which an ambient and an open frame (no mesh) are
-    needed. With an open frame ambient light and global are told apart pixel by pixel. `averaged`
-    takes the mean of all samples in full light and in the umbra, without it the single brightest
-    and darkest (the paper's). `planes["coverage"]` (uint16) counts the frames in full light or in
-    the umbra, whichever are fewer; 0: not covered.
+    `hole_fraction` is β; None: it is measured, by the part of the time that places are lit. With an
+    open frame (no mesh) ambient light and global are told apart pixel by pixel. `averaged` takes
+    the mean of all samples in full light and in the umbra, without it the single brightest and
+    darkest (the paper's). `planes["coverage"]` (uint16) counts the frames in full light or in the
+    umbra, whichever are fewer; 0: not covered.
     """
 
     def __init__(
@@ -66,11 +70,10 @@ class MeshOccluder:
 
     def _begin(self) -> None:
         self._plateaus = Plateaus()
-        self._noise = TemporalNoise(self._response.full_scale, _STILL)
+        self._noise = StillPlaces(self._response)
         self._table: Plane | None = None
         self._mean: NDArray[np.float64] | None = None  # of the sampled pixels' linear light
         self._last: NDArray[Any] | None = None
-        self._moved = False  # the last frame was interpolated
         self._left_out: NDArray[np.uint16] | None = None  # frames that tell nothing of a pixel
         self._followed = 0  # frames when coverage was last looked at
         self._share = 0.0
@@ -109,10 +112,9 @@ class MeshOccluder:
             self._mean = light
             self._last = pixels.copy()
         else:
-            self._noise.add(self._last[part], sample, interpolated=moved or self._moved)
             self._mean += light
             self._last[...] = pixels
-        self._moved = moved
+        self._noise.add(pixels, interpolated=moved)
         frames = self._plateaus.frames + 1
         if frames & (frames - 1) == 0 and (noise := self.noise()) is not None:
             self._table = self._deviations(noise)
@@ -129,8 +131,7 @@ class MeshOccluder:
 
     def noise(self) -> Noise | None:
         """See `Extremes`."""
-        noise = self._noise.noise()
-        return noise.of_a_sensor() if noise is not None and self._response.is_linear else noise
+        return self._noise.noise()
 
     def _deviations(self, noise: Noise) -> Plane:
         return noise.deviation(np.arange(self._response.full_scale + 1))
@@ -148,7 +149,7 @@ class MeshOccluder:
         one = self._response.deviation(noise, self._plateaus.high.extreme)
         ambient = self._references.mean(Lighting.AMBIENT)
         whole = self._references.mean(Lighting.OPEN)
-        beta = self._hole_fraction(ambient, whole)
+        beta = self._beta or self._lit_of_the_time(levels)
         if whole is not None and ambient is None:
             direct, indirect, other = light_model.from_mesh_and_open(
                 brightest, darkest, whole, beta
@@ -157,9 +158,10 @@ class MeshOccluder:
             other = np.zeros_like(brightest) if ambient is None else ambient
             direct, indirect = light_model.from_extremes(brightest - other, darkest - other, beta)
         known = ambient is not None or whole is not None
-        pull = self._pull(noise, brightest, darkest, other) if self._averaged else {}
+        pull = self._pull(noise, levels, other) if self._averaged else {}
         pitch = self._pitch(beta)
         covered = self._coverage(levels, one, pitch)
+        seen = self._lit_of_the_time(levels, covered.frames > 0)
         judged = Judgement.of_extremes(one, frames)
         if self._averaged:
             # Of a pixel that nothing happens to, noise alone parts the ends by 2 deviations.
@@ -184,12 +186,13 @@ class MeshOccluder:
                 "unused_frames": self._unused,
                 "hole_fraction": round(beta, 5),
                 "hole_fraction_from": "frames" if self._beta is None else "the scan",
+                "lit_of_the_time": round(seen, 4),
                 "leakage": 0.0,
                 "coverage": round(covered.share, 5),
                 "pitch_px": round(pitch, 2),
                 **({} if known else {"ambient_in_global": round(1.0 / beta, 3)}),
                 **({"noise_pulls_at_most": pull} if pull else {}),
-                "advice": _advice(None if known else beta, pull),
+                "advice": [*_unlike(self._beta, seen), *_advice(None if known else beta, pull)],
                 **self._references.facts(_source(ambient, whole)),
             },
         )
@@ -209,18 +212,19 @@ class MeshOccluder:
         between = self._response.linear_between
         return _Levels(between(high), between(low), on_high, on_low, lit, unlit, told)
 
-    def _pull(
-        self, noise: Noise | None, bright: Plane, dark: Plane, other: Plane
-    ) -> dict[str, float]:
-        """How far, at most, what is taken for noise pulls the levels together: medians of what it
-        takes of direct and adds to global, each as a part of it. In a place that is in full light,
-        or in the umbra, only for a moment a mean over a band is off by half of it. {}: nothing
-        tells."""
-        if noise is None:
-            return {}
-        ends = (self._plateaus.high.extreme, self._plateaus.low.extreme)
-        high, low = (np.float32(BAND / 2) * self._response.deviation(noise, x) for x in ends)
-        span, rest = bright - dark, dark - other
+    def _pull(self, noise: Noise | None, levels: _Levels, other: Plane) -> dict[str, float]:
+        """How far, at most, the bands that are averaged pull the levels together: medians of what
+        that takes of direct and adds to global, each as a part of it. In a place that is in full
+        light, or in the umbra, only for a moment a mean over a band is off by half of it. {}:
+        nothing tells."""
+        table = None if noise is None else self._deviations(noise)
+        brightest, darkest = (x.extreme for x in (self._plateaus.high, self._plateaus.low))
+        apart = brightest.astype(np.float32) - darkest
+        high, low = (
+            np.float32(BAND / 2) * spread(x, apart, table) * self._response.slope(x)
+            for x in (brightest, darkest)
+        )
+        span, rest = levels.bright - levels.dark, levels.dark - other
         tells = (span > 2 * high) & (rest > low)
         if not tells.any():
             return {}
@@ -229,22 +233,23 @@ class MeshOccluder:
             "global": round(float(np.median(low[tells] / rest[tells])), 4),
         }
 
-    def _hole_fraction(self, ambient: Plane | None, whole: Plane | None) -> float:
-        """β: as told, else the mean of all frames over the open one, ambient removed from both.
+    def _lit_of_the_time(self, levels: _Levels, covered: NDArray[np.bool_] | None = None) -> float:
+        """The part of the time that places are behind a hole: β, whatever the light of the room.
 
-        Over whole circles each point is behind a hole for β of the time, so that the mean is
-        β(L_d + L_g) + A. Raises NotYet where the frames that are needed have not come.
+        By what the mean of all frames is of the way from the umbra to full light, where the mesh's
+        shadow tells (and that is known: of `covered` pixels). Where places were never lit, too
+        large.
         """
-        if self._beta is not None:
-            return self._beta
-        if ambient is None or whole is None or self._mean is None:
-            raise NotYet("the hole fraction is measured with an ambient and an open frame")
+        assert self._mean is not None
         part = self._sampled(_SAMPLE)
-        passed = self._mean / self._plateaus.frames - ambient[part]
-        sent = (whole - ambient)[part].astype(np.float64)
-        bright = sent > np.median(sent)
-        measured = passed[bright].sum() / max(float(sent[bright].sum()), 1e-9)
-        return float(np.clip(measured, 1e-3, 0.999))
+        bright, dark = (x[part].astype(np.float64) for x in (levels.bright, levels.dark))
+        tells = bright - dark > _TELLING * bright
+        if covered is not None:
+            there = covered[part]
+            tells &= there if bright.ndim == 2 else there[..., None]
+        passed = (self._mean / self._plateaus.frames - dark)[tells].sum()
+        sent = (bright - dark)[tells].sum()
+        return float(np.clip(passed / sent, 1e-3, 0.999)) if sent > 0 else 0.5
 
     # ------------------------------------------------------------ coverage
 
@@ -422,6 +427,17 @@ def _source(ambient: Plane | None, whole: Plane | None) -> str:
     return "none" if whole is None else "open frame"
 
 
+def _unlike(beta: float | None, seen: float) -> list[str]:
+    """Whether places are lit for as much of the time as behind the mesh that was told."""
+    if beta is None or abs(seen - beta) < _UNLIKE * beta:
+        return []
+    return [
+        f"places are lit for {seen:.0%} of the time, and behind this mesh they would be for "
+        f"{beta:.0%}: the frames are not a mesh's, or not this one's, or it did not move far "
+        "enough; see --method and --hole-fraction, or leave that away to have it measured"
+    ]
+
+
 def _advice(beta: float | None, pull: dict[str, float]) -> list[str]:
     """What to know of the components: `beta` where ambient light is not known, what noise does."""
     lines = []
@@ -432,7 +448,7 @@ def _advice(beta: float | None, pull: dict[str, float]) -> list[str]:
         )
     if pull.get("direct", 0.0) > _PULLED:
         lines.append(
-            "Noise, and motion that looks like it, may make direct up to "
+            "Noise, and penumbra that it hides, may make direct up to "
             f"{pull['direct']:.0%} too small and global up to {pull['global']:.0%} too large "
             "(medians), where a place is in full light or in the umbra only for a moment: expose "
             "longer, move more slowly (--feed-mm-s), or take a coarser mesh or one that is nearer"

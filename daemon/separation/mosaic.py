@@ -14,6 +14,11 @@ Plane = NDArray[np.float32]
 
 _ORDERS = ("RG", "GR", "GB", "BG")
 _CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype=np.float32)
+_CELL = 16  # pixels a side, whose samples of one place in the mosaic are averaged
+_CELLS = 16
+_COLOURED = 0.08  # of the light: the least difference of colours, as medians over the cells
+_ERRORS = 4.0  # of such a median: noise alone makes no colours
+_GREENS = 0.3  # of that: the greens differ by less
 _SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32)
 
 
@@ -67,6 +72,42 @@ def demosaic_deviation(deviation: Plane, bayer: str) -> Plane:
             spread = np.sqrt(_filter(variance * present, np.square(kernel))) / weight
         rgb[..., channel] = np.where(mask, deviation, spread)
     return rgb
+
+
+def orders_of(pixels: NDArray[np.generic]) -> tuple[str, ...]:
+    """Which mosaics a grey picture (H, W) may be: RG and BG, or GR and GB; () if it is none.
+
+    Neighbours of a mosaic differ in the same way all over the picture, by their colours, but for
+    the two greens, which lie on a diagonal. Texture and noise differ now this way, now that.
+    """
+    height, width = (side // _CELL * _CELL for side in pixels.shape)
+    if not height or not width:
+        return ()
+    picture = pixels[:height, :width].astype(np.float32)
+    samples = picture.reshape(height // _CELL, _CELL // 2, 2, width // _CELL, _CELL // 2, 2)
+    means = samples.mean(axis=(1, 4)).transpose(1, 3, 0, 2).reshape(4, -1)  # of 2 x 2 places
+    light = means.mean(axis=0)
+    bright = light > 0.1 * np.quantile(light, 0.99)
+    if np.count_nonzero(bright) < _CELLS:
+        return ()
+    parts = means[:, bright] / light[bright]
+    middle = np.median(parts, axis=1, keepdims=True)
+    first, right, below, last = middle[:, 0]
+    apart = float(np.ptp((first, right, below, last)))
+    spread = 1.4826 * float(np.median(np.abs(parts - middle), axis=1).max())
+    error = 1.25 * spread / np.sqrt(parts.shape[1])  # of a median
+    if apart < max(_COLOURED, _ERRORS * error):
+        return ()
+    falling, rising = abs(first - last), abs(right - below)
+    if min(falling, rising) > _GREENS * apart:
+        return ()
+    if max(falling, rising) > _GREENS * apart:
+        sure = rising - falling
+    else:  # red is about as bright as blue, and green is brighter
+        sure = (first + last - right - below) / 2
+    if abs(sure) < _ERRORS * error:
+        return ()
+    return ("RG", "BG") if sure < 0 else ("GR", "GB")
 
 
 def _filter(plane: Plane, kernel: Plane) -> Plane:

@@ -8,7 +8,6 @@ an upper bound (`from_picture`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import Any
 
 import cv2
@@ -66,15 +65,6 @@ class Noise:
         whole = levels > _CLIPPED * expected
         return float(np.median(ratio[whole] if whole.any() else ratio))
 
-    def of_a_sensor(self) -> Noise:
-        """The same, with no level noisier than a linear sensor can be: its variance a + b x level
-        (read and shot noise) is bounded by that of any other level. What is beyond it is motion.
-        """
-        at, found = np.asarray(self.levels), np.asarray(self.deviations)
-        grown = np.maximum(np.sqrt(at[:, None] / at[None, :]), 1.0)
-        bounded = np.min(found[None, :] * grown, axis=1)
-        return Noise(self.levels, tuple(float(d) for d in bounded))
-
     def bounded_by(self, other: Noise) -> Noise:
         """The lower of two upper bounds where both are known, else the one that is."""
         levels = np.union1d(self.levels, other.levels)
@@ -99,14 +89,11 @@ class TemporalNoise:
     """Noise from pairs of frames in which part of the scene was the same.
 
     Differences are counted by level and size; the median of a level's tells its noise, whatever
-    moved in less than half of the picture. `quantile` below .5 withstands more motion, and is
-    coarser. Memory: one small table.
+    moved in less than half of the picture (see `still` for more). Memory: one small table.
     """
 
-    def __init__(self, full_scale: int, quantile: float = 0.5) -> None:
+    def __init__(self, full_scale: int) -> None:
         self._full_scale = full_scale
-        self._quantile = quantile
-        self._scale = 1.0 / NormalDist().inv_cdf(0.5 + quantile / 2.0)
         self._table = np.zeros((_LEVELS, _BINS), dtype=np.int64)
         self._smoothed = np.zeros_like(self._table)  # of pairs with an interpolated frame
         self.pairs = 0
@@ -132,19 +119,19 @@ class TemporalNoise:
         for index, row in enumerate(self._table if self._table.any() else self._smoothed):
             if row.sum() < _ENOUGH:
                 continue
-            found = self._scale * _difference(row, self._quantile) / np.sqrt(2.0)
+            found = _MAD * _difference(row) / np.sqrt(2.0)
             levels.append((index + 0.5) * (self._full_scale + 1) / _LEVELS)
             deviations.append(float(max(found, _ROUNDING)))
         return Noise(tuple(levels), tuple(deviations)) if levels else None
 
 
-def _difference(row: NDArray[np.int64], quantile: float) -> float:
-    """A quantile of a row of the table; differences of whole counts stand for ± half a count."""
+def _difference(row: NDArray[np.int64]) -> float:
+    """The median of a row of the table; differences of whole counts stand for ± half a count."""
     edges = np.exp2(np.arange(_BINS + 1) / _PER_OCTAVE) - 1.0
     share = np.cumsum(row) / row.sum()
-    at = int(np.searchsorted(share, quantile))
+    at = int(np.searchsorted(share, 0.5))
     before = share[at - 1] if at else 0.0
-    within = (quantile - before) / (share[at] - before)
+    within = (0.5 - before) / (share[at] - before)
     # a bin holds at most one whole count where it is narrow: spread it over ± half a count
     low, high = edges[at], edges[at + 1]
     if high - low < 1.0:

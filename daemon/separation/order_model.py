@@ -9,20 +9,39 @@ had again) and ranked.
 
 from __future__ import annotations
 
+import functools
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 Plane = NDArray[np.float32]
 
-_KNOTS = (0.0, 0.4, 0.55, 0.7, 0.85, 1.0, 1.2, 1.4, 1.6, 1.8, 2.1, 2.4)
+_KNOTS = (
+    0.0,
+    0.4,
+    0.45,
+    0.5,
+    0.55,
+    0.6,
+    0.65,
+    0.7,
+    0.8,
+    0.9,
+    1.0,
+    1.1,
+    1.2,
+    1.4,
+    1.6,
+    1.8,
+    2.1,
+    2.4,
+)
 
-# Of each interval but the first three parts, errors between knots being interpolated; a mean of a
-# sharp pattern's and of a slightly blurred one's is neither's.
-_TRIED = ((0, 0.0), *((at, part / 3) for at in range(1, len(_KNOTS) - 1) for part in range(3)))
+_PARTS = 3  # of each interval, errors between knots being interpolated
+_TRIED = tuple((at, part / _PARTS) for at in range(len(_KNOTS) - 1) for part in range(_PARTS))
 BLURS = (
     *(round(_KNOTS[at] * (1 - part) + _KNOTS[at + 1] * part, 4) for at, part in _TRIED),
     _KNOTS[-1],
@@ -32,15 +51,9 @@ BLURS = (
 RATIOS = (0.001, 0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Noise of a sample over the step from unlit to lit, for which errors are tabulated."""
 
-_FINE = np.linspace(np.log(RATIOS[0]), np.log(RATIOS[-1]), 240)
-_AMOUNTS = np.geomspace(1 / 30, 30, 172)  # 1 is not among them
-_KNOWN = 1.0  # relative misfit that a factor e between fitted and known noise costs
-_ABOVE = 0.1  # ... that a picture shows, which has at least its noise
-_UNEVEN = 0.02  # ... either way, where patterns light a neighbourhood differently
-_BELOW = 0.004  # ... at most, for texture in the picture may be the reason, ...
-_TEXTURE = 0.2  # ... and half of that at this logarithm
+_FINE = 120  # noise over the raw step that gaps are looked up at, evenly in its logarithm
+_AMOUNTS = np.geomspace(1.0, 30.0, 171)  # times their noise that samples may differ by
 _ALIKE = 0.1  # blurs whose cost differs by so much of the least explain about as well
-_LOUD = 0.04  # noise over the step below which blur shows, and a picture matters less
 _DOUBT = 0.5  # a bias that is corrected still costs this part of it: blur differs over a scene
 
 
@@ -74,15 +87,6 @@ class OrderErrors:
         """Mean of the k brightest less the k darkest (ratios)."""
         return 1.0 + self.lit[:, k - 1] - self.unlit[:, k - 1]
 
-    @cached_property
-    def fine(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """`gaps` at the noise of _FINE, and the logarithms of that noise over the raw step."""
-        log = np.log(RATIOS)
-        table = np.stack(
-            [np.interp(_FINE, log, column) for column in self.gaps.reshape(log.size, -1).T], axis=1
-        ).reshape(_FINE.size, *self.gaps.shape[1:])
-        return table, _FINE - np.log(np.interp(_FINE, log, self.step))
-
     @property
     def k(self) -> NDArray[np.int64]:
         """The number of samples whose mean has the least error (ratios)."""
@@ -93,12 +97,71 @@ class OrderErrors:
         return np.asarray(np.argmin(cost, axis=1) + 1)
 
 
-def simulate(levels: Callable[[float], Plane], keep: int) -> tuple[OrderErrors, ...]:
-    """Errors for each of BLURS. `levels(blur)` gives (patterns, samples) of a pixel's level, 0 to
-    1, at places all over the pattern set."""
-    knots = [_errors(levels(blur), keep) for blur in _KNOTS]
-    found = [_between(knots[at], knots[at + 1], part) for at, part in _TRIED]
-    return (*found, knots[-1])
+class OrderModels:
+    """`OrderErrors` at each of BLURS, for a pattern set: `levels(blur)` gives (patterns, samples)
+    of a pixel's level, 0 to 1, at places all over it."""
+
+    def __init__(self, levels: Callable[[float], Plane], keep: int) -> None:
+        knots = [_errors(levels(blur), keep) for blur in _KNOTS]
+        found = [_between(knots[at], knots[at + 1], part) for at, part in _TRIED]
+        self._models = (*found, knots[-1])
+        ratios = np.asarray(RATIOS)
+        seen = [ratios / model.step for model in self._models]
+        self._low = float(np.log(min(s[0] for s in seen)))
+        self._high = float(np.log(max(s[-1] for s in seen)))
+        fine = np.exp(np.linspace(self._low, self._high, _FINE))
+        self._gaps = np.stack(
+            [
+                np.stack([np.interp(fine, s, c) for c in m.gaps.reshape(ratios.size, -1).T], axis=1)
+                for s, m in zip(seen, self._models, strict=True)
+            ]
+        ).reshape(len(self._models), _FINE, 2, -1)
+
+    def at(self, place: float) -> tuple[float, OrderErrors]:
+        """A blur, and its errors, at a place of BLURS that `fit` has found."""
+        first = min(int(place), len(BLURS) - 2)
+        part = place - first
+        blur = round((1.0 - part) * BLURS[first] + part * BLURS[first + 1], 3)
+        return blur, _between(self._models[first], self._models[first + 1], part)
+
+    def fit(
+        self,
+        gaps: NDArray[np.float64],
+        noise: NDArray[np.float64],
+        used: NDArray[np.bool_] | None = None,
+        *,
+        uneven: bool = False,
+    ) -> tuple[float, float]:
+        """The blur that explains observed gaps, as a place of BLURS.
+
+        `gaps` (groups, 2, keep - 1) as in `OrderErrors`; `noise` (groups, 2) is that of lit and of
+        unlit samples over the raw step; `used` (groups, 2), at least one a group: which gaps count
+        (None: all). Also how many times their noise samples differ by: 1, or if `uneven`, where
+        global light differs from pattern to pattern and from group to group, found as well.
+        """
+        share = np.ones(gaps.shape[:2]) if used is None else used.astype(np.float64)
+        # misfits are relative to it, for each group to have its say
+        size = np.maximum(np.einsum("gek,ge->g", gaps**2, share), 1e-9)  # 0: no noise at all
+        away = np.log(_AMOUNTS) if uneven else np.zeros(1)
+        wanted = np.log(noise) + away[:, None, None]  # (amounts, groups, 2)
+        place = (wanted - self._low) * ((_FINE - 1) / (self._high - self._low))
+        first = np.clip(place, 0, _FINE - 2).astype(np.intp)
+        part = np.clip(place - first, 0.0, 1.0)[..., None]
+        below, above = (self._gaps[:, at, np.arange(2)] for at in (first, first + 1))
+        table = below + part * (above - below)  # (blurs, amounts, groups, 2, keep - 1)
+        cost = (np.square(table - gaps).sum(axis=4) * share).sum(axis=3) / size
+        costs = cost.min(axis=1).sum(axis=1)
+        amounts = _AMOUNTS[np.median(np.argmin(cost, axis=1), axis=1).astype(np.intp)]
+        # of blurs that explain it about as well the mean: none of them is far from it
+        weight = np.exp((costs.min() - costs) / (_ALIKE * costs.min() + 1e-9))
+        if uneven:  # which looks like the least of blurs: there is none, or that of the first knot
+            weight[1:_PARTS] = 0.0
+        weight /= weight.sum()
+        found = float(weight @ np.arange(costs.size))
+        if uneven and found < _PARTS:
+            found = float(_PARTS * round(found / _PARTS))
+            return found, float(amounts[int(found)])
+        return found, float(weight @ amounts)
 
 
 def _between(low: OrderErrors, high: OrderErrors, part: float) -> OrderErrors:
@@ -107,9 +170,24 @@ def _between(low: OrderErrors, high: OrderErrors, part: float) -> OrderErrors:
     )
 
 
+@functools.lru_cache(maxsize=4 * len(_KNOTS))
+def _place_for(digest: bytes, keep: int) -> list[OrderErrors]:
+    """Where errors are kept once they are known: the next scan is often of the same patterns."""
+    del digest, keep
+    return []
+
+
 def _errors(levels: Plane, keep: int) -> OrderErrors:
-    rng = np.random.default_rng(0)
     places = np.ascontiguousarray(levels.T, dtype=np.float32)
+    shape = str(places.shape).encode()
+    kept = _place_for(hashlib.blake2b(places.tobytes(), digest_size=32, key=shape).digest(), keep)
+    if not kept:
+        kept.append(_simulated(places, keep))
+    return kept[0]
+
+
+def _simulated(places: Plane, keep: int) -> OrderErrors:
+    rng = np.random.default_rng(0)
     # two draws a place: what they differ by is noise, not place
     noise = rng.standard_normal((2, *places.shape), dtype=np.float32)
     k = np.arange(1, keep + 1)
@@ -135,59 +213,3 @@ def _covariances(lit: NDArray[np.float64], unlit: NDArray[np.float64]) -> NDArra
     """Of (places, keep): the variances of both, and their covariance: (3, keep)."""
     pairs = (lit, lit), (unlit, unlit), (lit, unlit)
     return np.stack([np.einsum("pk,pk->k", a, b) for a, b in pairs]) / len(lit)
-
-
-def fit(
-    models: tuple[OrderErrors, ...],
-    gaps: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    *,
-    known: bool = False,
-    even: bool = True,
-    used: NDArray[np.bool_] | None = None,
-) -> tuple[int, NDArray[np.float64], int, float]:
-    """The blur (an index of BLURS) and the noise that explain observed gaps.
-
-    `gaps` (groups, 2, keep - 1) as in `OrderErrors`. `noise` (kinds, groups, 2) is that of the lit
-    and of the unlit over the raw step, as it may depend on their light; how much of it there is, is
-    found, starting from 1 times. Blur spreads the ranks ever wider, noise the first ones most, and
-    blur in proportion to the step, so that the two are told apart; where hardly, the 1 decides,
-    more so if `known`, less so if patterns do not light every neighbourhood alike (`even`). `used`
-    (groups, 2), at least one a group: which gaps count (None: all).
-
-    Returns the noise over the step (groups, 2), its kind, and how much of it there is.
-    """
-    share = np.ones(gaps.shape[:2]) if used is None else used.astype(np.float64)
-    # misfits are relative to it, for each group to have its say
-    size = np.maximum(np.einsum("gek,ge->g", gaps**2, share), 1e-9)  # 0: there is no noise at all
-    away = np.log(_AMOUNTS)
-    loud = min(float(np.median(noise)) / _LOUD, 1.0)
-    texture = _BELOW * loud / (1.0 + np.square(_TEXTURE / away))
-    below, above = (_KNOWN * away**2,) * 2 if known else (texture, _ABOVE * away**2)
-    prior = np.where(away > 0, above, below) if even else _UNEVEN * away**2
-    wanted = np.log(noise)[:, None] + away[:, None, None]  # (kinds, amounts, groups, 2)
-    group, end = np.indices(noise.shape[1:])
-    costs = np.empty(len(models))
-    found: list[tuple[NDArray[np.float64], int, float]] = []
-    for index, model in enumerate(models):
-        table, raw = model.fine
-        misfit = ((gaps[:, None] - table[None]) ** 2).sum(axis=3)
-        misfit *= (share / size[:, None])[:, None]
-        place = np.interp(wanted, raw, np.arange(raw.size))
-        cost = misfit[group, np.rint(place).astype(np.intp), end].sum(axis=3)
-        cost += prior[:, None] * share.sum(axis=1)  # (kinds, amounts, groups)
-        if even:
-            kind, amount = (
-                int(n) for n in np.unravel_index(int(np.argmin(cost.sum(axis=2))), cost.shape[:2])
-            )
-            costs[index] = cost[kind, amount].sum()
-        else:  # what global light adds differs from group to group
-            kind = int(np.argmin(cost.min(axis=1).sum(axis=1)))
-            costs[index] = cost[kind].min(axis=0).sum()
-            amount = int(np.median(np.argmin(cost[kind], axis=0)))
-        ratios = np.exp(np.interp(place[kind, amount], np.arange(raw.size), _FINE))
-        found.append((ratios, kind, float(_AMOUNTS[amount])))
-    # of blurs that explain it about as well the mean: none of them is far from it
-    weight = np.exp((costs.min() - costs) / (_ALIKE * costs.min() + 1e-9))
-    blur = round(float(weight @ np.arange(costs.size) / weight.sum()))
-    return blur, *found[blur]

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import Judgement, bits, finish
+from daemon.separation.handedness import strength
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
+from daemon.separation.residue import mirrored
 from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import compare
-from daemon.separation.straddling import Straddling
+from daemon.separation.straddling import as_neighbours, between_halves, edges
 
 
 class ComplementPair:
@@ -69,14 +71,26 @@ class ComplementPair:
             self._references, (first + second) * np.float32(0.5), deviation, self._leakage
         )
         direct, indirect = light_model.from_complement_pair(lit, unlit, self._alpha, self._leakage)
-        pattern = Straddling.of_pair(
-            lit, unlit, self._alpha, self._leakage, deviation, self._response.bayer
+        planes = self._deviations(told, deviation, told.deviation(np.minimum(first, second)))
+        wave, part, noise = self._seen(lit, unlit, deviation)
+        mosaic = bool(self._response.bayer)
+        between = between_halves(wave, noise)
+        edge = edges(np.abs(wave) * part, noise * part, between, mosaic=mosaic)
+        total: Plane = direct + indirect
+        split = as_neighbours(direct, total, planes["direct_std"], edge, mosaic=mosaic)
+        direct, indirect = split.direct, total - split.direct
+        planes["direct_std"], planes["global_std"] = split.stated(
+            planes["direct_std"], planes["global_std"], total, planes["direct_std"]
         )
-        flags = bits(pattern.straddling, Quality.LOW_MODULATION)
-        if pattern.mirrored is not None:
-            flags |= bits(pattern.mirrored, Quality.RESIDUE)
+        flags = bits(split.known, Quality.EDGE) | bits(edge & ~split.known, Quality.LOW_MODULATION)
+        waves = [wave.astype(np.complex64)]
+        strong = strength(waves, noise)
+        reflected, mirrors = mirrored(waves, strong, turning=False, smooth=False)
+        if reflected is not None:
+            flags |= bits(reflected, Quality.RESIDUE)
         if moved is not None:
             flags |= moved
+        share = float(np.mean(edge))
         return finish(
             direct,
             indirect,
@@ -84,7 +98,7 @@ class ComplementPair:
             brightest=brightest,
             saturated=self._saturated,
             flags=flags,
-            planes=self._deviations(told, deviation, told.deviation(np.minimum(first, second))),
+            planes=planes,
             judgement=Judgement.of_extremes(deviation, 2),
             facts={
                 "estimator": "complement pair",
@@ -95,15 +109,29 @@ class ComplementPair:
                 **told.facts(),
                 **self._references.facts(source),
                 **steady,
-                **pattern.facts,
+                **mirrors,
+                "edges": round(share, 4),
                 **self._residual(first, second),
                 "advice": advice + told.advice(),
             },
         )
 
+    def _seen(self, lit: Plane, unlit: Plane, deviation: Plane) -> tuple[Plane, Plane, Plane]:
+        """Lit less unlit light of both images (H, W), which is h P - g I; what makes it a part of
+        all the light; and its noise. Colours are added."""
+        g = light_model.global_weight(self._alpha, self._leakage)
+        h = light_model.global_weight(1.0 - self._alpha, self._leakage)
+        wave: Plane = np.float32(h) * lit - np.float32(g) * unlit
+        whole: Plane = lit + unlit
+        noise: Plane = deviation * np.float32(np.hypot(g, h))
+        if wave.ndim == 3:
+            wave, whole = wave.sum(axis=2), whole.sum(axis=2)
+            noise = np.asarray(np.sqrt(np.square(noise).sum(axis=2)), dtype=np.float32)
+        part: Plane = np.reciprocal(np.maximum(whole, np.float32(1e-3)))
+        return wave, part, noise
+
     def _deviations(self, told: Told, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
-        """Standard deviations of direct and global from noise where lit and unlit; edges of
-        checkers, which are the greater error of two images, are not noise."""
+        """Standard deviations of direct and global from noise where lit and unlit."""
         b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
         h = light_model.global_weight(1.0 - self._alpha, b)
         singular = min(light_model.complement_determinants(self._alpha, b))

@@ -8,6 +8,7 @@ told by the first alone, the rim of a ball by the second alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,26 +46,34 @@ def mirrored(
     return (np.logical_or.reduce(found) if found else None), facts
 
 
-def of_shifts(sums: WaveSums | None, deviation: Plane) -> tuple[Mask | None, dict[str, Any], bool]:
-    """`mirrored` of a scan's sums, `deviation` that of a sample; and whether the frames can be the
-    patterns that were declared, in their order.
+@dataclass(frozen=True, slots=True)
+class Mirrors:
+    """Where a mirror shows the pattern, (H, W) bool or None where the frames cannot tell; facts;
+    and whether the frames can be the patterns that were declared, in their order."""
+
+    mask: Mask | None
+    facts: dict[str, Any]
+    as_declared: bool = True
+
+
+def of_shifts(sums: WaveSums | None, deviation: Plane) -> Mirrors:
+    """`mirrored` of a scan's sums, `deviation` that of a sample.
 
     Two waves are a checkerboard's x + y and x - y, one wave that of random patches, of which
     nothing tells the order.
     """
     waves = None if sums is None else sums.waves()
     if sums is None or waves is None:
-        return None, {"mirrors_looked_for": False}, True
+        return Mirrors(None, {"mirrors_looked_for": False})
     strong = strength(waves, deviation * np.float32(sums.gain))
     if len(waves) == 1:
-        mask, facts = mirrored(waves, strong, turning=False, smooth=False)
-        return mask, facts, True
+        return Mirrors(*mirrored(waves, strong, turning=False, smooth=False))
     unlike = imbalance(waves, strong)
     misfit = {"pattern_misfit": None if unlike is None else round(unlike, 4)}
     if unlike is not None and unlike > _UNLIKE:
-        return None, {"mirrors_looked_for": False, **misfit}, False
+        return Mirrors(None, {"mirrors_looked_for": False, **misfit}, as_declared=False)
     mask, facts = mirrored(waves, strong, turning=True, smooth=True)
-    return mask, {**facts, **misfit}, True
+    return Mirrors(mask, {**facts, **misfit})
 
 
 NOT_SHIFTS = (
@@ -76,6 +85,10 @@ NOT_SHIFTS = (
 
 
 def patch_weights(patterns: int) -> NDArray[np.complex128]:
-    """Weights of `WaveSums` (patterns, 1) that give each patch of a random set a phase."""
-    turn = 2.0 * np.pi * np.arange(patterns) / patterns
-    return np.asarray(np.exp(1j * turn)[:, None], dtype=np.complex128)
+    """Weights of `WaveSums` (patterns, 1) that give each patch of a random set a phase; those of
+    the last fifth are 0, for the others tell enough."""
+    needed = patterns - patterns // 5
+    turn = 2.0 * np.pi * np.arange(needed) / needed
+    weights = np.zeros((patterns, 1), dtype=np.complex128)
+    weights[:needed, 0] = np.exp(1j * turn)
+    return weights

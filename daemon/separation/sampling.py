@@ -17,6 +17,17 @@ _LEAST_PIXELS = 64
 _MAD = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 
 
+def thinned(plane: NDArray[Any], most: int = 8192) -> NDArray[Any]:
+    """About so many of a plane's samples, all over it, flat: enough for a median or a quantile."""
+    flat = plane.reshape(-1)
+    step = max(flat.size // most, 1)
+    if step > 1 and plane.ndim > 1:  # not all in the same columns, or of one colour
+        step |= 1
+        while np.gcd(step, int(np.prod(plane.shape[1:]))) > 1:
+            step += 2
+    return flat[::step]
+
+
 class Moments:
     """Mean and variance of frames at each sample: two planes, whatever their number."""
 

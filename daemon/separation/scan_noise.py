@@ -20,6 +20,7 @@ from daemon.separation.radiometry import Plane, Response
 _SAMPLE = 4
 _ENOUGH = 100  # samples that make a level's deviation
 _LEVELS = 24
+_MORE = 3.0  # times what a picture shows, an upper bound of noise: that is none
 
 
 def _pictured(response: Response, pixels: NDArray[Any]) -> Noise:
@@ -75,30 +76,23 @@ class ScanNoise:
     def _picture(self) -> Noise | None:
         return None if self._pattern is None else self._bounds.of(self._pattern)
 
-    def own(self) -> Told:
-        """What the scan's frames alone say."""
-        repeats = self._repeats.noise()
-        source = PICTURE if repeats is None else REPEATS
-        source = self._response.noise_from or source
-        return Told(self._response, repeats or self._picture, self._average, source)
+    def told(self, residual: Noise | None = None) -> Told:
+        """What is known by now; `residual`: the noise of one frame in what the light that patterns
+        have in common leaves over (`Followed`).
 
-    def told(self, ranks: Noise | None = None) -> Told:
-        """What is known by now; `ranks`: the noise of one frame that explains how far apart the
-        ranks of samples are, for which a picture is no match.
-
-        A calibration is believed unless the scan's own frames contradict it: repeats either way,
-        else a picture and ranks together (each may hold more than noise) or a picture with less.
+        A calibration is believed unless the scan's own frames contradict it.
         """
-        repeats = self._repeats.noise()
-        if repeats is not None:
-            return told(self._response, repeats, REPEATS, [repeats], self._average, sure=True)
-        bounds = [bound for bound in (self._picture, ranks) if bound is not None]
-        if ranks is not None:
-            return told(self._response, ranks, RANKS, bounds, self._average)
-        return told(self._response, self._picture, PICTURE, bounds, self._average)
+        picture = self._picture
+        if residual is not None and picture is not None and residual.over(picture) > _MORE:
+            residual = None  # the light has not the order that it was said to have
+        for found, source in ((self._repeats.noise(), REPEATS), (residual, RESIDUALS)):
+            if found is not None:
+                return told(self._response, found, source, [found], self._average, sure=True)
+        bounds = [] if picture is None else [picture]
+        return told(self._response, picture, PICTURE, bounds, self._average)
 
 
-REPEATS, RANKS, PICTURE = "repeated frames", "ranks", "one picture"
+REPEATS, PICTURE = "repeated frames", "one picture"
 RESIDUALS, CALIBRATION = "residuals of the fit", "calibration"
 
 _SURE, _UNSURE = 1.25, 1.5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -22,6 +22,12 @@ from daemon.separation.steadiness import leaks
 _ASTRAY = 1.5  # times the change across stripes: along them there is no more
 _OFF = 0.1  # of the light: peaks and valleys are off by less for blur and noise
 _HALF = 0.1  # lit fractions so near to a half have their middle at ½(W + K)
+_RESOLVED = 4.0  # samples of a colour a period: with fewer none need lie wholly in a stripe
+_PIECE = 64  # pixels of a row, whose frequency is looked for
+_CLEAR = 8.0  # times the power of other frequencies
+_FAINT = 4.0  # deviations of white: a step of so many counts for half
+_BEYOND = np.float32(0.25)  # of the step: noise takes no level further
+_LIT, _UNLIT = 0.8, 0.3  # typical levels of peaks and valleys
 _PEAK = 0.82 * 0.9
 """Deviation of a row's peaks in a square over a pixel's: a peak is the larger of two pixels as
 bright, and light interpolated between peaks is the mean of more than one."""
@@ -35,6 +41,10 @@ class PeaksAndValleys:
     stripes by `along` pixels along them. Light between peaks is interpolated across the stripes and
     averaged over `reduce` x `reduce` pixels; likewise between valleys; then Eq. 8. Each colour of a
     mosaic is a picture of its own, of half the size. Planes: `direct_std`, `global_std`.
+
+    With a black and a white frame peaks are those of (I - K)/(W - K), in which texture is no light:
+    (L_d + α L_g)/(L_d + L_g) where lit, α L_g/(L_d + L_g) where not, whatever the leakage.
+
     Every image is separated on its own, so a stream is separated live; memory does not grow.
     """
 
@@ -105,7 +115,9 @@ class PeaksAndValleys:
         if self._picture is None or self._saturated is None:
             raise NotYet("no image has come yet")
         picture = self._picture
-        lit, unlit = self._extremes(picture)
+        noise = self._noise(picture)
+        scale = Scale.of(self._references, noise)
+        lit, unlit = self._extremes(picture, scale)
         ambient, source = self._references.ambient(
             lit, unlit, self._alpha, self._leakage, self._reduced
         )
@@ -113,12 +125,30 @@ class PeaksAndValleys:
         if ambient is not None:
             lit, unlit = lit - ambient, unlit - ambient
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, self._leakage)
-        saturated = self._reduced(self._saturated.astype(np.float32)) > 0
-        noise = self._noise(picture)
+        clipped = self._saturated
+        if scale is not None and (white := self._references.white_saturated) is not None:
+            clipped = clipped | white
+        saturated = self._reduced(clipped.astype(np.float32)) > 0
         deviation = noise.deviation(brightest)
-        planes = self._stated(noise, deviation, noise.deviation(darkest))
+        most, least = deviation, noise.deviation(darkest)
+        if scale is not None:
+            most, least = (
+                np.sqrt(np.square(sd) + self._reduced(scale.variance(level, self._frames)))
+                for sd, level in ((most, _LIT), (least, _UNLIT))
+            )
+        planes = self._stated(noise, most, least)
         mirrored = self._mirrored(picture, noise)
         looked, advice = self._looked(picture, brightest, darkest)
+        if scale is not None and (period := self._period(scale.levels(picture))) is not None:
+            looked["stripes_px"] = round(period / 2.0, 3)
+            resolved = _RESOLVED * (2.0 if self._response.bayer else 1.0)
+            if period < resolved:
+                advice.append(
+                    f"stripes are {period / 2:.1f} camera pixels wide: most pixels see lit and "
+                    "unlit at once, so that direct light is too small, and what it lacks counts "
+                    f"as global: show wider ones (--stripe), or come closer, for {resolved / 2:g} "
+                    "pixels and more"
+                )
         plain = replace(self._response, bayer="")
         return finish(
             direct,
@@ -136,6 +166,7 @@ class PeaksAndValleys:
                 "lit_fraction": self._alpha,
                 "leakage": self._leakage,
                 "reduced_by": self._reduce,
+                "texture_from": "none" if scale is None else "black and white frames",
                 **noise.facts(),
                 "mirrors_looked_for": mirrored is not None,
                 **looked,
@@ -178,6 +209,25 @@ class PeaksAndValleys:
             else:
                 lines += leaks(self._references, self._leakage)
         return facts, lines
+
+    def _period(self, levels: Plane) -> float | None:
+        """Of the stripes, in camera pixels: a median over pieces of rows; None if there is none."""
+        step = 2 if self._response.bayer else 1  # one colour of a mosaic
+        rows = levels[::step, ::step] if levels.ndim == 2 else levels.mean(axis=2)
+        if self._across == "y":
+            rows = rows.T
+        count = rows.shape[1] // _PIECE
+        if not count:
+            return None
+        pieces = rows[:, : count * _PIECE].reshape(rows.shape[0], count, _PIECE)
+        pieces = (pieces - pieces.mean(axis=2, keepdims=True)) * np.hanning(_PIECE)
+        power = np.square(np.abs(np.fft.rfft(pieces, axis=2))).mean(axis=0)
+        power[:, : _PIECE // 16] = 0.0  # light that changes so slowly is no stripes'
+        peak = power.argmax(axis=1)
+        clear = power.max(axis=1) > _CLEAR * np.median(power, axis=1)
+        if not clear.any():
+            return None
+        return float(step * _PIECE / np.median(peak[clear]))
 
     def _mirrored(self, picture: Plane, told: Told) -> NDArray[np.bool_] | None:
         """Where the stripes run astray, at the lower resolution; None without black and white
@@ -232,17 +282,20 @@ class PeaksAndValleys:
         shown = self._bounds.of(shown)
         return told(self._response, shown, PICTURE, [shown])
 
-    def _extremes(self, picture: Plane) -> tuple[Plane, Plane]:
+    def _extremes(self, picture: Plane, scale: Scale | None) -> tuple[Plane, Plane]:
         """L_max and L_min at the lower resolution, RGB for a mosaic."""
+        levels = picture if scale is None else scale.levels(picture)
         if not self._response.bayer:
-            lit, unlit = self._both(picture, self._window, self._along)
-            return self._reduced(lit), self._reduced(unlit)
-        lit, unlit = np.empty_like(picture), np.empty_like(picture)
-        window, along = (max(n // 2, 1) | 1 for n in (self._window, self._along))
-        for y in range(2):
-            for x in range(2):
-                colour = np.ascontiguousarray(picture[y::2, x::2])
-                lit[y::2, x::2], unlit[y::2, x::2] = self._both(colour, window, along)
+            lit, unlit = self._both(levels, self._window, self._along)
+        else:
+            lit, unlit = np.empty_like(levels), np.empty_like(levels)
+            window, along = (max(n // 2, 1) | 1 for n in (self._window, self._along))
+            for y in range(2):
+                for x in range(2):
+                    colour = np.ascontiguousarray(levels[y::2, x::2])
+                    lit[y::2, x::2], unlit[y::2, x::2] = self._both(colour, window, along)
+        if scale is not None:
+            lit, unlit = scale.light(lit), scale.light(unlit)
         return self._reduced(lit), self._reduced(unlit)
 
     def _both(self, picture: Plane, window: int, along: int) -> tuple[Plane, Plane]:
@@ -269,6 +322,51 @@ class PeaksAndValleys:
                 share = np.float32(0.5 if colour == "G" else 1.0)
                 rgb[..., "RGB".index(colour)] += share * sites[:, y, :, x]
         return rgb
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """The light of each pixel from black to white: levels of it are free of texture."""
+
+    black: Plane
+    step: Plane  # white less black
+    sure: Plane  # 0 where the step is lost in noise, 1 where it is well above
+    of_white: Plane  # variance of the white frames' mean ...
+    of_black: Plane  # ... and of the black ones'
+
+    @classmethod
+    def of(cls, references: References, noise: Told) -> Scale | None:
+        """None without both frames."""
+        black, white = references.mean(Lighting.BLACK), references.mean(Lighting.WHITE)
+        if black is None or white is None:
+            return None
+        deviation = noise.deviation(white)
+        step: Plane = np.maximum(white - black, deviation)
+        squared = np.square(step)
+        return cls(
+            black,
+            step,
+            squared / (squared + np.square(np.float32(_FAINT) * deviation)),
+            np.square(deviation) * np.float32(1.0 / references.frames(Lighting.WHITE)),
+            np.square(noise.deviation(black)) * np.float32(1.0 / references.frames(Lighting.BLACK)),
+        )
+
+    def levels(self, light: Plane) -> Plane:
+        """0 for black, 1 for white; what is faint tends to a half, to be neither peak nor valley
+        for its noise."""
+        half = np.float32(0.5)
+        level = np.clip((light - self.black) / self.step, -_BEYOND, 1 + _BEYOND)
+        return np.asarray(half + (level - half) * self.sure, dtype=np.float32)
+
+    def light(self, levels: Plane) -> Plane:
+        """Light of these levels."""
+        return np.asarray(self.black + levels * self.step, dtype=np.float32)
+
+    def variance(self, level: float, frames: int) -> Plane:
+        """What the references add to the variance of a peak or valley of about this level, each of
+        one of `frames` frames that are averaged."""
+        of = self.of_white * np.float32(level**2) + self.of_black * np.float32((1 - level) ** 2)
+        return np.asarray(of * np.float32(frames), dtype=np.float32)
 
 
 def block_mean(plane: Plane, k: int) -> Plane:

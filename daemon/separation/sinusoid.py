@@ -27,6 +27,7 @@ from daemon.separation.residue import mirrored
 from daemon.separation.ripple import Ripple, ripple
 from daemon.separation.scan_noise import ResidualNoise, Told
 from daemon.separation.steadiness import compare
+from daemon.separation.straddling import Split, as_neighbours, between_phases, edges
 from daemon.separation.weave import Woven
 
 _LEAST_ECCENTRIC = 0.02
@@ -55,7 +56,7 @@ class LeastSquares:
     `phases[i]` is pattern i's (frequency, δ in radians). Planes: `direct_std`, `global_std` (as the
     components), `phase` (H, W) in 0..2π of the first frequency, and `column` or `row` (H, W) in
     projector pixels where `periods` say how to get it. `blur_px`: the optics' as calibrated, for
-    where the frames do not tell it.
+    where the frames do not tell it. `patches`: phases are even within patches, and jump between.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class LeastSquares:
         weave: float = 0.0,
         axis: str = "x",
         blur_px: float | None = None,
+        patches: bool = False,
     ) -> None:
         self._response = response
         self._phases = tuple(phases)
@@ -78,6 +80,7 @@ class LeastSquares:
         self._weave = weave
         self._axis = axis
         self._known_blur = blur_px
+        self._patches = patches
         self._references = References(response)
         self._fits = [_Fit() for _ in range(1 + max(f for f, _ in phases))]
         self._noise = ResidualNoise(response)
@@ -117,15 +120,29 @@ class LeastSquares:
         direct, indirect, direct_var, global_var = _combine(solved)
         brightest = np.maximum.reduce([fit.brightest() for fit in ready])
         quality = np.zeros(direct.shape[:2], dtype=np.uint16)
+        between: dict[str, Any] = {}
+        if self._patches:
+            split = self._between_patches(ready[0], noise, direct, indirect, np.sqrt(direct_var))
+            total: Plane = direct + indirect
+            direct, indirect = split.direct, total - split.direct
+            total_std = np.sqrt(np.maximum(global_var - direct_var, np.float32(0.0)))
+            direct_std, global_std = split.stated(
+                np.sqrt(direct_var), np.sqrt(global_var), total, total_std
+            )
+            direct_var, global_var = np.square(direct_std), np.square(global_std)
+            quality |= bits(split.known, Quality.EDGE)
+            between["edges"] = round(float(np.mean(split.known)), 4)
         if len(solved) > 1:
             quality |= bits(_disagree(solved), Quality.DISAGREE)
         reflected, told = self._mirrored(ready[0], noise)
         rippled = self._ripple(ready, noise)
         if reflected is not None:
             quality |= bits(reflected, Quality.RESIDUE)
+        doubt = self._doubt(blur)
+        of_blur = np.square(direct * np.float32(doubt))
         planes: dict[str, NDArray[Any]] = {
-            "direct_std": np.sqrt(direct_var),
-            "global_std": np.sqrt(global_var),
+            "direct_std": np.sqrt(direct_var + of_blur),
+            "global_std": np.sqrt(global_var + of_blur),
         }
         planes.update(self._correspondence(ready))
         mean = np.add.reduce([fit.solve()[0] for fit in ready]) * np.float32(1.0 / len(ready))
@@ -142,6 +159,7 @@ class LeastSquares:
             "frequencies": len(ready),
             "blur_px": None if blur is None else round(blur, 3),
             "blur_from": blur_from,
+            "blur_unsure": round(doubt, 4),
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
@@ -151,6 +169,7 @@ class LeastSquares:
             ),
             **told,
             **steady,
+            **between,
             "misfit": None if misfit is None else round(misfit, 3),
             "ripple": [[round(one.tone, 4), round(one.frames, 4)] for one in rippled],
             "advice": [
@@ -168,8 +187,8 @@ class LeastSquares:
             brightest=brightest,
             saturated=self._saturated,
             judgement=Judgement(
-                direct=np.float32(SIGNIFICANT) * planes["direct_std"],
-                total=np.float32(SIGNIFICANT) * planes["global_std"],
+                direct=np.float32(SIGNIFICANT) * np.sqrt(direct_var),
+                total=np.float32(SIGNIFICANT) * np.sqrt(global_var),
                 deviation=self._level(ready[0], noise),
             ),
             flags=quality,
@@ -202,7 +221,7 @@ class LeastSquares:
             woven = self._woven(ready[0], 0)
             found = None if woven is None else woven.blur(ready[0].grey()[0])
             return found, "" if found is None else "weave"
-        squares = np.asarray([-log(of_wave(1.0, p, self._weave)) for p in self._periods])
+        squares = np.asarray([-4.0 * log(of_wave(0.5, p, self._weave)) for p in self._periods])
         logs = []
         first = None
         for fit in ready:
@@ -214,6 +233,15 @@ class LeastSquares:
             logs.append(0.5 * float(np.log(np.maximum(np.median(ratio), 1e-6))))
         slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
         return float(np.sqrt(max(-slope, 0.0))), "scan"
+
+    def _doubt(self, blur: float | None) -> float:
+        """The part of direct light that the blur leaves unsure, as a deviation: a quarter of what
+        it took, for it is one figure for all the scene; unknown, half of what 1 px of it takes."""
+        if not self._periods:
+            return 0.0
+        part, sigma = (0.5, 1.0) if blur is None else (0.25, blur)
+        kept = [of_wave(sigma, period, self._weave) for period in self._periods]
+        return part * (1.0 - sum(kept) / len(kept))
 
     def _unknown(self, blur: float | None) -> list[str]:
         """A line where blur may matter and is not known."""
@@ -270,6 +298,23 @@ class LeastSquares:
         total_var = total.of_references(noise.deviation)
         total_var += np.square(of_mean) * np.asarray(mean_var * total.of_half, dtype=np.float32)
         return direct, indirect, direct_var, direct_var + total_var
+
+    def _between_patches(
+        self, fit: _Fit, noise: Told, direct: Plane, indirect: Plane, deviation: Plane
+    ) -> Split:
+        """Random phases: what the edges of patches have too little of, see `straddling`."""
+        mean, wave = fit.grey()
+        light: Plane = np.maximum(mean, np.float32(1e-3))
+        contrast: Plane = np.asarray(np.abs(wave) / light, dtype=np.float32)
+        between = between_phases(wave)
+        mosaic = bool(self._response.bayer)
+        edge = edges(contrast, self._grey_noise(fit, noise) / light, between, mosaic=mosaic)
+        return as_neighbours(direct, direct + indirect, deviation, edge, mosaic=mosaic)
+
+    def _grey_noise(self, fit: _Fit, noise: Told) -> Plane:
+        """Of the wave's amplitude (H, W), colours added."""
+        one = self._level(fit, noise) * np.float32(fit.variances()[1] ** 0.5)
+        return one if one.ndim == 2 else np.asarray(np.sqrt(np.square(one).sum(axis=2)), np.float32)
 
     def _mirrored(self, fit: _Fit, noise: Told) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
         """Where the phase runs against the picture's, or changes faster: see `residue`."""

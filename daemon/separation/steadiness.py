@@ -18,6 +18,7 @@ from daemon.separation.estimator import Lighting, Quality
 from daemon.separation.finish import bits
 from daemon.separation.radiometry import Plane
 from daemon.separation.references import References
+from daemon.separation.sampling import thinned
 
 HALF = 0.02
 """Lit fractions so near to a half are one."""
@@ -47,12 +48,14 @@ def compare(
         return None, {}, []
     expected = (white + black) * np.float32(0.5)
     good = _good(black, white, clipped)
-    if not good.any():
+    if not thinned(good).any():
         return None, {}, []
-    ratio = float(np.median(half[good] / np.maximum(expected[good], np.float32(1e-6))))
+    some = thinned(good)
+    usual = np.maximum(thinned(expected)[some], np.float32(1e-6))
+    ratio = float(np.median(thinned(half)[some] / usual))
     facts = {"mean_ratio": round(ratio, 4)}
     lines: list[str] = []
-    noisy = float(np.median(deviation[good] / np.maximum(expected[good], np.float32(1e-6))))
+    noisy = float(np.median(thinned(deviation)[some] / usual))
     if abs(ratio - 1.0) >= max(_OFF, noisy if ranked else 0.0):
         lines.append(
             f"under half of the source the scene has {ratio:.2f} of half the light of white and "
@@ -74,7 +77,8 @@ def compare(
 
 def _good(black: Plane, white: Plane, clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Samples that the source lights."""
-    return ~clipped & (white - black > 0.1 * float(np.quantile(white - black, 0.99)))
+    lit = white - black
+    return ~clipped & (lit > np.float32(0.1 * float(np.quantile(thinned(lit), 0.99))))
 
 
 def _calm(plane: Plane) -> Plane:
@@ -90,9 +94,10 @@ def leaks(references: References, leakage: float) -> list[str]:
     if dark is None or lit is None or clipped is None:
         return []
     good = _good(dark, lit, clipped)
-    if not good.any():
+    if not thinned(good).any():
         return []
-    black, white = _calm(dark)[good], _calm(lit)[good]
+    some = thinned(good)
+    black, white = thinned(_calm(dark))[some], thinned(_calm(lit))[some]
     low, middle, high = (float(q) for q in np.quantile(black / white, [0.25, 0.5, 0.75]))
     if middle < -_OVER:
         return [

@@ -1,71 +1,125 @@
-"""What a pattern and its complement tell of the pattern in the picture: edges, and mirrors.
+"""Pixels at an edge of the pattern, which see two parts of it at once: found, and split anew.
 
-A pixel at the edge of a checker is partly lit in both images. Eq. 8 does not know by how much, so
-that a part of its direct light counts as global, and at half and half all of it: no third image
-says otherwise, but the neighbours do, whose contrast is whole.
+A pixel between a lit and an unlit checker, or between patches of two phases, is partly lit in every
+image. Too little of it comes and goes, so that a part of its direct light counts as global, and at
+half and half all of it. No further image says by how much, but the neighbours do, whose contrast is
+whole. All of the light is known at the edge as elsewhere; it is the neighbours' part of it that is
+taken for direct.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation import light_model
-from daemon.separation.handedness import strength
-from daemon.separation.residue import mirrored
+from daemon.separation.handedness import Wave
 
 Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_NEAR = 5  # pixels across: lit and unlit checkers so near to each other leave an edge between
-_WHOLE = 0.85  # of the contrast nearby: less is an edge's
+_NEAR = 5  # pixels across: parts of a pattern so near to each other leave an edge between
+_WHOLE = 0.93  # of the contrast nearby: less is an edge's
 _TOLD = 3.0  # deviations of noise
+_ALIKE = 0.95  # length of the mean of phases that are alike
+_REACHES = (5, 9, 17)  # pixels across, within which whole neighbours are looked for
+_SOME = 0.1  # of the weight there must be theirs
+
+
+def between_halves(wave: Plane, noise: Plane) -> Mask:
+    """Pixels (H, W) with both lit and unlit ones nearby: `wave` is above and below 0 there."""
+    limit = np.float32(_TOLD) * noise
+    return _near(wave > limit) & _near(wave < -limit)
+
+
+def between_phases(wave: Wave) -> Mask:
+    """Pixels (H, W) with different phases of a complex wave nearby."""
+    phase = wave / np.maximum(np.abs(wave), np.float32(1e-6))
+    parts = (
+        cv2.blur(np.ascontiguousarray(part), (_NEAR, _NEAR)) for part in (phase.real, phase.imag)
+    )
+    return np.asarray(np.hypot(*parts) < np.float32(_ALIKE))
+
+
+def edges(contrast: Plane, noise: Plane, between: Mask, *, mosaic: bool) -> Mask:
+    """Of pixels `between`, those whose contrast, a part of the light of deviation `noise` (both
+    (H, W)), is less than it is nearby, in a mosaic in the same colour, by more than noise."""
+    kernel = np.ones((_NEAR, _NEAR), np.uint8)
+    if mosaic:
+        kernel[1::2, :] = kernel[:, 1::2] = 0
+    most = np.asarray(cv2.dilate(contrast, kernel))
+    short = most * np.float32(_WHOLE) - contrast
+    return np.asarray(between & (short > np.float32(_TOLD) * noise))
 
 
 @dataclass(frozen=True, slots=True)
-class Straddling:
-    """`straddling` (H, W) pixels see lit and unlit checkers at once; `mirrored` as in `residue`."""
+class Split:
+    """`direct` of a frame's shape with the neighbours' part of the light at edges; `deviation`: how
+    much neighbours differ in that, beyond noise; `known`: the edges (H, W) that have neighbours."""
 
-    straddling: Mask
-    mirrored: Mask | None
-    facts: dict[str, Any]
+    direct: Plane
+    deviation: Plane
+    known: Mask
 
-    @classmethod
-    def of_pair(
-        cls, first: Plane, second: Plane, alpha: float, leakage: float, deviation: Plane, bayer: str
-    ) -> Straddling:
-        """Of a pattern of lit fraction α and its complement, ambient light removed, of one sample's
-        `deviation`; all of a frame's shape. Colours of a mosaic are compared with their own."""
-        g = light_model.global_weight(alpha, leakage)
-        h = light_model.global_weight(1.0 - alpha, leakage)
-        wave: Plane = np.float32(h) * first - np.float32(g) * second
-        whole: Plane = first + second
-        noise: Plane = deviation * np.float32(np.hypot(g, h))
-        if wave.ndim == 3:
-            wave, whole = wave.sum(axis=2), whole.sum(axis=2)
-            noise = np.asarray(np.sqrt(np.square(noise).sum(axis=2)), dtype=np.float32)
-        waves = np.asarray(wave, dtype=np.complex64)
-        mask, facts = mirrored([waves], strength([waves], noise), turning=False, smooth=False)
-        edges = _edges(wave, np.maximum(whole, np.float32(1e-3)), noise, mosaic=bool(bayer))
-        share = round(float(np.mean(edges)), 4)
-        return cls(edges, mask, {**facts, "straddling": share})
+    def stated(
+        self, direct_std: Plane, global_std: Plane, total: Plane, total_std: Plane
+    ) -> tuple[Plane, Plane]:
+        """Deviations of both components: at edges those of parts of the total, elsewhere as given;
+        and how much neighbours differ."""
+        part: Plane = np.clip(self.direct / np.maximum(total, np.float32(1e-3)), 0.0, 1.0)
+        known = _as(self.known, part)
+        of_direct: Plane = np.where(known, part * total_std, direct_std)
+        of_global: Plane = np.where(known, (np.float32(1.0) - part) * total_std, global_std)
+        return np.hypot(of_direct, self.deviation), np.hypot(of_global, self.deviation)
 
 
-def _edges(wave: Plane, whole: Plane, noise: Plane, *, mosaic: bool) -> Mask:
-    kernel = np.ones((_NEAR, _NEAR), np.uint8)
-    limit = np.float32(_TOLD) * noise
-    between = _near(wave > limit, kernel) & _near(wave < -limit, kernel)
+def as_neighbours(direct: Plane, total: Plane, noise: Plane, edge: Mask, *, mosaic: bool) -> Split:
+    """Give edges (H, W) the part of `total` that is direct in the nearest pixels which are none.
+
+    `noise` is the standard deviation of `direct`. The deviation is that of the pixels beside edges
+    too, for a contrast that is a little short is not told from a whole one.
+    """
+    light: Plane = np.maximum(total, np.float32(0.0))
+    weight: Plane = light * _as(~edge, light).astype(np.float32)
+    by = np.float32(1.0) / np.maximum(light, np.float32(1e-3))
+    part: Plane = np.clip(direct * by, 0.0, 1.0)
+    square: Plane = np.square(part) - np.square(np.minimum(noise * by, np.float32(1.0)))
+    found, deviation = direct.copy(), np.zeros_like(direct)
+    left = _near(edge)
+    for reach in _REACHES:
+        kernel, wider = (_bell(size, mosaic=mosaic) for size in (reach, 2 * reach - 1))
+        here = left & (cv2.filter2D((~edge).astype(np.float32), -1, kernel) > np.float32(_SOME))
+        mean = _mean(part, weight, kernel)
+        spread = _mean(square, weight, wider) - np.square(_mean(part, weight, wider))
+        at = _as(here, light) & np.ones(light.shape, np.bool_)
+        deviation[at] = (np.sqrt(np.maximum(spread, np.float32(0.0))) * light)[at]
+        at &= _as(edge, light)
+        found[at] = (mean * light)[at]
+        left &= ~here
+    return Split(found, deviation, edge & ~left)
+
+
+def _mean(plane: Plane, weight: Plane, kernel: Plane) -> Plane:
+    sums = np.maximum(cv2.filter2D(weight, -1, kernel), np.float32(1e-3))
+    return np.asarray(cv2.filter2D(weight * plane, -1, kernel) / sums, dtype=np.float32)
+
+
+def _as(mask: Mask, plane: Plane) -> Mask:
+    return mask if plane.ndim == 2 else mask[..., None]
+
+
+def _bell(size: int, *, mosaic: bool) -> Plane:
+    """A Gaussian's kernel, of a mosaic at the samples of the same colour alone."""
+    line = cv2.getGaussianKernel(size, size / 4.0)
+    kernel = np.asarray(line @ line.T, dtype=np.float32)
     if mosaic:
-        kernel[1::2, :] = kernel[:, 1::2] = 0
-    contrast = np.abs(wave) / whole
-    most = np.asarray(cv2.dilate(contrast, kernel))
-    edge = contrast + limit / whole < most * np.float32(_WHOLE)
-    return np.asarray(between & edge)
+        odd = (size // 2 + 1) % 2
+        kernel[odd::2, :] = kernel[:, odd::2] = 0.0
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
 
-def _near(mask: Mask, kernel: NDArray[np.uint8]) -> Mask:
+def _near(mask: Mask) -> Mask:
+    kernel = np.ones((_NEAR, _NEAR), np.uint8)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel)) > 0

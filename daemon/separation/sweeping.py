@@ -15,6 +15,7 @@ _TELLS = 0.2  # of a box's light, that comes and goes
 _BRIGHT = 0.1  # of the brightest boxes' light
 _ENOUGH = 64  # boxes
 _LIT = 0.75  # of the time that a stick leaves a place lit, at least
+_MOSTLY = 0.5  # ... however wide it is, or slow
 _STEP = 0.15  # of what a place ever changes by, from frame to frame; a stick's is far less
 
 
@@ -54,11 +55,11 @@ class Sweeping:
         lit = float(np.median(((self._sum / self._frames - self._low)[tells]) / span[tells]))
         step = float(np.median(self._steps[tells] / span[tells])) / (self._frames - 1)
         facts = {"lit_of_the_time": round(lit, 4), "change_per_frame": round(step, 4)}
-        if lit > _LIT or step < _STEP:
+        if lit > _LIT or (lit > _MOSTLY and step < _STEP):
             return facts, []
         return facts, [
             f"these frames do not look like a stick's: {1 - lit:.0%} of the light is missing at a "
-            f"time, and {step:.0%} of it moves from one frame to the next, as under projected "
-            "patterns; a stick's shadow is small and moves little: name the method that the scene "
-            "was lit for (--method), or sweep a thinner stick slowly"
+            f"time, and {step:.0%} of it moves from one frame to the next, as behind a mesh or "
+            "under projected patterns; a stick's shadow is small and moves little: name the method "
+            "that the scene was lit for (--method), or sweep a thinner stick slowly"
         ]

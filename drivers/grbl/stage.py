@@ -142,10 +142,11 @@ class GrblStage(Stage):
         return StageInfo(travel, min(feeds), it.acceleration_mm_s2)
 
     def check(self) -> None:
-        """One status query. Raises DeviceRefused for an alarm that nobody has acknowledged."""
+        """One status query. An alarm is a state, for somebody to look at, and not a fault that a
+        new connection might mend: that would forget it."""
         self._condition.begin("check")
-        self._condition.raise_alarm("check")
-        self._condition.ask("check")
+        if self._link.alarm is None:
+            self._condition.ask("check")
 
     def safe(self) -> None:
         """Stopped and held by its motors, nothing queued. See `stop`."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,17 +15,13 @@ from numpy.typing import NDArray
 from drivers.base.pixelformat import PixelFormat
 from drivers.clock import NS
 from drivers.virtual.bench import Bench
+from drivers.virtual.cameraoptions import CORRECT_LEVEL, CORRECT_US, CameraOptions
 from drivers.virtual.geometry import F32
 from drivers.virtual.sky import Sway
 from drivers.virtual.timeline import Forgotten
 from drivers.virtual.transport import mosaic, pick, room
 from drivers.virtual.view import view
 
-if TYPE_CHECKING:
-    from drivers.virtual.camera import CameraOptions
-
-CORRECT_US = 1e6 / 60  # with this exposure and no gain ...
-CORRECT_LEVEL = 0.8  # ... radiance 1 gives this part of the scale
 ROLLING_BANDS = 16  # rows of a rolling shutter are exposed in so many groups
 LUMINANCE = np.asarray((0.30, 0.59, 0.11), np.float32)  # a mono sensor's response
 

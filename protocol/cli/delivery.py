@@ -35,7 +35,12 @@ class Delivery:
     def check(self, expected: Iterable[str] = PRODUCTS) -> None:
         """Raises UmbraError(bad_request) if the products could not be put there."""
         if not self.folder.exists() and not self.folder.is_symlink():
-            parent = next(p for p in self.folder.parents if p.exists())
+            parent = self.folder.parent
+            if not parent.exists():
+                raise _refuse(
+                    f"there is no folder {parent} to make {self.folder.name} in: make it first, or "
+                    "choose another with -o"
+                )
             if not parent.is_dir():
                 raise _refuse(f"{parent} is not a folder; choose another with -o")
             if not _writable(parent):
@@ -61,7 +66,6 @@ class Delivery:
         new = not self.folder.exists()
         beside = self.folder.parent if new else self.folder  # the same file system, for rename
         try:
-            beside.mkdir(parents=True, exist_ok=True)
             filling = Path(tempfile.mkdtemp(prefix=".umbra-", dir=beside))
         except OSError as error:
             raise _refuse(f"{beside}: {error.strerror}; choose another folder with -o") from error
@@ -86,6 +90,14 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, not its parents, where it is not there yet. Raises UmbraError."""
+    try:
+        path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise _refuse(f"cannot make {path}: {error.strerror}; choose another with -o") from error
 
 
 def write_file(path: Path, data: bytes | memoryview) -> None:

@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 from protocol.cli.app import command_of
 from protocol.cli.options import build, options_of, with_options
 from protocol.errors import Code, UmbraError
+from protocol.spelling import did_you_mean
 
 
 def members(union: Any) -> dict[str, type[msgspec.Struct]]:
@@ -28,7 +29,9 @@ def member(union: Any, tag: str, option: str) -> type[msgspec.Struct]:
     known = members(union)
     if tag not in known:
         raise UmbraError(
-            Code.BAD_REQUEST, f"{option}: {tag!r} is not one of {', '.join(known)}", option
+            Code.BAD_REQUEST,
+            f"{option}: {tag!r} is not one of {', '.join(known)}" + did_you_mean(tag, known),
+            option,
         )
     return known[tag]
 

@@ -17,6 +17,7 @@ import typer
 from msgspec import inspect as shape
 
 from protocol.errors import Code, UmbraError
+from protocol.spelling import did_you_mean
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -123,7 +124,8 @@ class Option:
         if wrong:
             raise UmbraError(
                 Code.BAD_REQUEST,
-                f"{self.flag}: {wrong[0]!r} is not one of {', '.join(self.choices)}",
+                f"{self.flag}: {wrong[0]!r} is not one of {', '.join(self.choices)}"
+                + did_you_mean(wrong[0], self.choices),
                 self.flag,
             )
         return value

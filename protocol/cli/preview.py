@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from protocol.cli.delivery import write_file
+from protocol.cli.delivery import make_folder, write_file
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.output import on_terminal, print_json, say
 from protocol.errors import Code, UmbraError
@@ -168,7 +168,7 @@ def _write(out: Path, pixels: NDArray[np.uint8], number: int, *, numbered: bool)
 
     path = out
     if numbered:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         path = out / f"{number:06d}.png"
     write_file(path, png(pixels))
 

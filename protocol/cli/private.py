@@ -23,6 +23,7 @@ from protocol.client import Client
 from protocol.errors import Code, UmbraError
 
 START_S = 30.0  # a cold start imports OpenCV and Zarr
+ANSWER_S = 30.0  # of one that is there: its machine may be busy
 STOP_S = 10.0
 MAX_PATH = 100  # of a Unix socket, with a little room: the system's limit is 107
 
@@ -101,7 +102,7 @@ def _when_ready(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> C
             code = Code.BAD_INPUT if process.returncode == 2 else Code.UNREACHABLE
             raise UmbraError(code, f"the private daemon did not start: {_last_line(log)}")
         try:
-            return Client(endpoint, keys=False, timeout_s=0.5)
+            client = Client(endpoint, keys=False, timeout_s=0.5)
         except UmbraError as error:
             if error.code is not Code.UNREACHABLE:
                 raise
@@ -110,6 +111,9 @@ def _when_ready(process: subprocess.Popen[bytes], endpoint: str, log: Path) -> C
                     Code.UNREACHABLE,
                     f"the private daemon is silent after {START_S:.0f} s: {_last_line(log)}",
                 ) from error
+        else:
+            client.timeout_s = ANSWER_S
+            return client
 
 
 def _last_line(log: Path) -> str:
@@ -129,11 +133,14 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def toml(tables: Mapping[str, Any]) -> str:
-    """A configuration as TOML: tables of strings, numbers, booleans and lists of those."""
+    """A configuration as TOML: tables of strings, numbers, booleans and lists of those, and lists
+    of such tables."""
     lines = []
-    for name, table in tables.items():
-        lines.append(f"[{name}]")
-        lines += [f"{key} = {_value(value)}" for key, value in table.items() if value is not None]
+    for name, found in tables.items():
+        several = isinstance(found, list)
+        for table in found if several else [found]:
+            lines.append(f"[[{name}]]" if several else f"[{name}]")
+            lines += [f"{key} = {_value(it)}" for key, it in table.items() if it is not None]
     return "\n".join(lines) + "\n"
 
 

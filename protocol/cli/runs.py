@@ -19,7 +19,13 @@ if TYPE_CHECKING:
     from protocol.client import Client
 
 Out = Annotated[
-    Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the products; made if new.")
+    Path,
+    typer.Option(
+        "-o",
+        "--out",
+        metavar="DIR",
+        help="Folder for the products; made if new, its parent is not.",
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace files that are there already.")]
 
@@ -140,6 +146,7 @@ def fetch(client: Client, info: RunInfo, delivery: Delivery, names: list[str]) -
 
 
 _SOON = {"pause": "pauses after this step", "abort": "is being aborted", "resume": "goes on"}
+_QUEUED = "is queued, ahead of the others, to go on where it stopped"
 
 
 def _steer(verb: str, run: str, rig: str | None, keys: str | None, as_json: bool) -> None:
@@ -151,7 +158,8 @@ def _steer(verb: str, run: str, rig: str | None, keys: str | None, as_json: bool
         print_json(Run(run=info))
     else:
         under_way = not info.state.ended and info.state is not RunState.PAUSED
-        print(f"run {info.id}: {_SOON[verb] if under_way else info.state.value}")
+        soon = _QUEUED if verb == "resume" and info.state is RunState.QUEUED else _SOON[verb]
+        print(f"run {info.id}: {soon if under_way else info.state.value}")
 
 
 def pause(run: RunId = "", rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:

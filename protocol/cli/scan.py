@@ -13,7 +13,7 @@ import msgspec
 import typer
 
 from protocol.cli.delivery import Delivery
-from protocol.cli.family import Family, command_for
+from protocol.cli.family import Family, command_for, members
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.options import with_options
 from protocol.cli.output import print_json, say
@@ -24,6 +24,7 @@ from protocol.errors import Code, UmbraError
 from protocol.messages import replies
 from protocol.scans.anyscan import AnyCalibration, AnyScan, AnySeparation, AnyVerification
 from protocol.scans.measuring import Advise
+from protocol.spelling import did_you_mean, fields_at
 
 if TYPE_CHECKING:
     from protocol.client import Client
@@ -119,6 +120,7 @@ class Verifications(Family):
 
 def spec_in(file: Path) -> AnyScan:
     """The spec in a TOML or JSON file: `method` and its fields. Raises UmbraError(bad_request)."""
+    table: Any = None
     try:
         text = file.read_text(encoding="utf-8")
         table = json.loads(text) if file.suffix == ".json" else tomllib.loads(text)
@@ -127,8 +129,22 @@ def spec_in(file: Path) -> AnyScan:
         raise UmbraError(Code.BAD_REQUEST, f"{file}: {error.strerror}", "--file") from error
     except ValueError as error:  # of either format, of the encoding, or msgspec's own
         message = str(error).replace("`", "").replace("Object contains", "there is an")
-        raise UmbraError(Code.BAD_REQUEST, f"{file}: {message}", "--file") from error
+        raise UmbraError(
+            Code.BAD_REQUEST, f"{file}: {message}{_meant(str(error), table)}", "--file"
+        ) from error
     return spec
+
+
+def _meant(problem: str, table: Any) -> str:
+    """What msgspec's problem with a spec may be a typing error of."""
+    what, _, path = problem.partition(" - at ")
+    methods = members(AnyScan)
+    method = table.get("method") if isinstance(table, dict) else None
+    if method not in methods:
+        return did_you_mean(method, methods) if isinstance(method, str) else ""
+    if not what.startswith("Object contains unknown field"):
+        return ""
+    return did_you_mean(what.split("`")[1], fields_at(methods[method], path))
 
 
 def _scan(

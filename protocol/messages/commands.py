@@ -69,8 +69,9 @@ class Reprocess(Command, frozen=True, kw_only=True, tag="reprocess"):
     """Separate the recorded frames of a run that has ended anew; answers at once with a new run.
 
     `changes` are other values for fields of its spec by name, also for those of `radiometry`: the
-    ones that say how frames are read. What says what was shown or exposed is refused. Needs no
-    device, and does not wait in the queue of scans. The run that it is made from stays as it is.
+    ones that say how frames are read; null is as if it had not been said: as calibrated, or its
+    default. What says what was shown or exposed is refused. Needs no device, and does not wait in
+    the queue of scans. The run that it is made from stays as it is.
     """
 
     role: ClassVar[Role] = Role.OPERATOR

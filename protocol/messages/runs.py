@@ -20,10 +20,11 @@ class RunState(enum.StrEnum):
            │          │      finishing  aborted | failed | interrupted ──resume──> queued
            │          │          v
            │          │         done
-           └──────────┴──> aborted;  waiting ──> failed | interrupted
+           └──────────┴──> aborted;  waiting ──> failed
 
     `waiting`: for what it needs before its first frame (`Progress.waits`); left out where all is
-    there. `interrupted` is what a restart makes of a run that was under way.
+    there. `interrupted` is what a restart makes of a run that was under way; one that waited is
+    queued again.
     """
 
     QUEUED = "queued"

@@ -59,7 +59,7 @@ class Stick(OccluderScan, frozen=True, kw_only=True, tag="stick"):
     """
 
     lit_fraction: LitFraction = 1.0
-    estimator: Annotated[Literal["maxmin"], Meta(description=ESTIMATOR)] = "maxmin"
+    estimator: Annotated[Literal["auto", "maxmin"], Meta(description=ESTIMATOR)] = "auto"
     axis: Annotated[Axis, Meta(description="axis of the stage along which the stick moves")] = (
         Axis.X
     )
@@ -73,7 +73,7 @@ class Stick(OccluderScan, frozen=True, kw_only=True, tag="stick"):
 
 class Mesh(OccluderScan, frozen=True, kw_only=True, tag="mesh"):
     """A grid of holes on a small circle, on video (§4.2): α is the hole fraction β, b = 0 in the
-    umbra. β is told, or follows from the mesh, or is measured (with an ambient and an open frame).
+    umbra. β is told, or follows from the mesh, or is measured: places are lit for β of the time.
     """
 
     hole_fraction: (

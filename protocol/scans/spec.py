@@ -103,7 +103,9 @@ class Spec(
 ):
     """What every run can be told, whatever it is for."""
 
-    note: Annotated[str, Meta(description="what the run is for, kept with it")] = ""
+    note: Annotated[str, Meta(max_length=4096, description="what the run is for, kept with it")] = (
+        ""
+    )
     exposure_us: Annotated[Positive, Meta(description="exposure of a frame in µs")] | None = None
     gain: Annotated[float, Meta(description="of the camera, in its own unit")] | None = None
     auto_exposure: Annotated[

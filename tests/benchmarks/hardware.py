@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from drivers import registry
 from drivers.base.camera import Acquisition, Camera, CameraSettings
 from drivers.base.device import Context

@@ -23,7 +23,7 @@ from typing import Literal
 
 import numpy as np
 
-from daemon.frames import FrameRecord, FrameStore
+from daemon.storage.frames import FrameRecord, FrameStore
 from drivers import registry
 from drivers.base.camera import Acquisition, Camera, CameraSettings
 from drivers.base.device import Context

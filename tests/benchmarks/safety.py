@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from daemon.config import parse
-from daemon.rig import Rig
+from daemon.devices.rig import Rig
 from drivers.base.camera import Acquisition
 from protocol.scans.projected import Checkerboard
 from tests.benchmarks.bench import daemon

@@ -1,4 +1,4 @@
-"""The cost of taking a frame in: `MaxMin.update` against in-place NumPy maximum and minimum."""
+"""The cost of taking a frame in: `Extremes.update` against in-place NumPy maximum and minimum."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Observation
-from daemon.separation.extremes import MaxMin
+from daemon.separation.extremes import Extremes
 from daemon.separation.radiometry import Response
 from tests.benchmarks.ratio import Ratio, in_turn
 
@@ -31,7 +31,7 @@ def run() -> list[Ratio]:
             noise.integers(0, full_scale, (height, width), np.dtype(f"uint{bits}"))
             for _ in range(3)
         ]  # more than one, so that no cache holds them all
-        estimator = MaxMin(
+        estimator = Extremes(
             Response(full_scale=full_scale, black=0.0, tone="linear"),
             lit_fraction=0.5,
             leakage=0.0,
@@ -60,7 +60,7 @@ def _floor(frames: list[NDArray[Any]], high: NDArray[Any], low: NDArray[Any]) ->
     return act
 
 
-def _update(frames: list[NDArray[Any]], estimator: MaxMin) -> Callable[[], None]:
+def _update(frames: list[NDArray[Any]], estimator: Extremes) -> Callable[[], None]:
     observations = [Observation(pattern=n) for n in range(len(frames))]
 
     def act() -> None:

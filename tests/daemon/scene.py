@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -20,12 +21,31 @@ from daemon.separation.estimator import Components
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
-from protocol.patterns import BLACK
+from protocol.patterns import BLACK, AnyPattern
 from protocol.scans.anyscan import AnyScan
 from tests.daemon.scanning import scanned
 
 FULL = 65535
 OWN_US = 10_000.0
+
+
+@lru_cache(maxsize=128)
+def _sent(
+    pattern: AnyPattern,
+    size: tuple[int, int],
+    leakage: float,
+    gamma: float,
+    blur: float,
+    reach: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What the projector sends under a pattern, and what of it is all around: for many scans."""
+    shown = patterns.render(pattern, *size) / 255.0
+    emitted: Any = leakage + (1 - leakage) * shown**gamma
+    if blur:
+        emitted = cv2.GaussianBlur(emitted, (0, 0), blur)
+    around = cv2.blur(emitted, (65, 65), borderType=cv2.BORDER_REFLECT)
+    around = cv2.GaussianBlur(around, (0, 0), reach, borderType=cv2.BORDER_REFLECT)
+    return emitted, np.asarray(around)
 
 
 @dataclass
@@ -65,12 +85,10 @@ class Scene:
         """What the camera counts under a step's pattern."""
         light: NDArray[Any] = np.full((self.height, self.width), self.ambient * FULL)
         if step.pattern is not None:
-            shown = patterns.render(step.pattern, self.width, self.height) / 255.0
-            emitted: Any = self.leakage + (1 - self.leakage) * shown**self.gamma
-            if self.blur:
-                emitted = cv2.GaussianBlur(emitted, (0, 0), self.blur)
-            around = cv2.blur(emitted, (65, 65), borderType=cv2.BORDER_REFLECT)
-            around = cv2.GaussianBlur(around, (0, 0), self.reach, borderType=cv2.BORDER_REFLECT)
+            emitted, around = _sent(
+                step.pattern, (self.width, self.height), self.leakage, self.gamma, self.blur,
+                self.reach,
+            )  # fmt: skip
             light = light + emitted * self.direct + around * self.indirect
         light = self.change(light, step) * ((step.exposure_us or OWN_US) / OWN_US)
         light = light + rng.normal(0, 1, light.shape) * self.sigma * FULL

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import structlog.testing
 
-from daemon import aftermath, config
-from daemon.runfolder import RunFolder
-from daemon.store import Store
+from daemon import config
+from daemon.runs import aftermath
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import Store
 from protocol.messages.runs import End, RunState
 from protocol.scans.projected import TwoImage
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from daemon import measured
-from daemon.calibration import Calibrations
-from daemon.runfolder import RunFolder
+from daemon.products import measured
+from daemon.runs.calibration import Calibrations
 from daemon.separation.estimator import Measurement
-from daemon.store import Store
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import Store
 from protocol.messages.runs import RunState
 from protocol.scans.anyscan import AnyScan
 from protocol.scans.calibrations import (

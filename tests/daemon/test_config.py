@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from daemon import config
-from daemon.access import check_exposure, is_local
+from daemon.serving.access import check_exposure, is_local
 
 
 def test_no_file_is_the_virtual_rig_on_loopback() -> None:

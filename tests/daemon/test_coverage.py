@@ -43,8 +43,10 @@ def sweep(positions: Iterable[float], noise: float = 150.0, stick: int = 8) -> l
     return frames
 
 
-def separate(frames: list[NDArray[Any]], response: Response = DEEP) -> Components:
-    estimator = Occluder(response, lit_fraction=1.0)
+def separate(
+    frames: list[NDArray[Any]], response: Response = DEEP, *, averaged: bool = True
+) -> Components:
+    estimator = Occluder(response, lit_fraction=1.0, averaged=averaged)
     for index, frame in enumerate(frames):
         estimator.update(frame, Observation(pattern=index))
     return estimator.result()
@@ -64,6 +66,23 @@ def test_a_whole_sweep_separates_and_flags_nothing_as_never_unlit() -> None:
     assert not np.isnan(found.direct).any()
     np.testing.assert_allclose(found.direct, direct, atol=1400)
     np.testing.assert_allclose(found.global_, indirect, atol=800)
+
+
+def test_full_light_is_a_mean_and_not_what_noise_made_brightest() -> None:
+    """Once and three times in the umbra; the shadow lies on the first columns from the start."""
+    direct, _ = scene()
+    lit = np.ones((HEIGHT, WIDTH), dtype=np.bool_)
+    lit[CAST] = lit[DARK] = False
+    for step in (8, 3):
+        frames = [*sweep([0], 1000.0) * 3, *sweep(range(-8, WIDTH, step), 1000.0)]
+        frames += sweep([WIDTH + 1] * 20, 1000.0)
+        off = [
+            (separate(frames, averaged=a).direct - direct) / direct.mean() for a in (True, False)
+        ]
+        assert abs(np.mean(off[0][lit])) < 0.03
+        assert np.mean(off[1][lit]) > 0.1
+        assert abs(np.mean(off[0][:, :8])) < 0.06
+        assert off[0][lit].std() < 0.75 * np.sqrt(np.mean(np.square(off[1][lit])))
 
 
 def test_the_scenes_own_shadow_has_no_direct_light_and_says_so() -> None:
@@ -175,6 +194,19 @@ def test_frames_of_shifted_checkerboards_are_not_a_sticks_and_it_says_so() -> No
     assert [line for line in found.facts["advice"] if "do not look like a stick's" in line]
     assert found.facts["change_per_frame"] > 0.25
     assert found.facts["lit_of_the_time"] == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_meshs_frames_are_not_a_sticks_however_slow_and_it_says_so() -> None:
+    direct, indirect = scene()
+    y, x = np.indices(direct.shape)
+    frames = [
+        np.rint(((x + k) // 10 % 3 == 0) * ((y // 10) % 3 == 0) * direct + indirect).astype(
+            np.uint16
+        )
+        for k in range(30)
+    ]
+    found = separate(frames)
+    assert [line for line in found.facts["advice"] if "do not look like a stick's" in line]
 
 
 @pytest.mark.parametrize(("noise", "stick", "stride"), [(150, 8, 2), (2000, 8, 4), (150, 24, 12)])

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from daemon.devicethread import DeviceThread, Revoked, Session, Stuck
+from daemon.devices.devicethread import DeviceThread, Revoked, Session, Stuck
 from drivers.base.device import Context, Identity, Options
 from drivers.base.errors import DeviceGarbled, DeviceLost
 from drivers.base.light import Light
@@ -99,7 +99,7 @@ def test_a_late_call_is_halted_first(lamp: DeviceThread[Lamp]) -> None:
 def test_a_call_that_never_comes_back_is_named(
     lamp: DeviceThread[Lamp], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daemon.devicethread._HALT_GRACE_S", 0.4)
+    monkeypatch.setattr("daemon.devices.devicethread._HALT_GRACE_S", 0.4)
     lamp.device.deaf = True
     assert lamp.call(lambda _: True, 5)  # its thread is up: on a loaded machine that takes time
     with pytest.raises(Stuck, match=r"lamp: call: the driver has not come back in 0.4 s"):

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon import rig as rig_module
 from daemon.config import RigConfig, parse
-from daemon.course import Course
+from daemon.devices import rig as rig_module
+from daemon.devices.rig import Rig
 from daemon.patterns import render
-from daemon.rig import Rig
-from daemon.store import Store
-from daemon.viewfinder import Viewfinder
+from daemon.pictures.viewfinder import Viewfinder
+from daemon.runs.course import Course
+from daemon.storage.store import Store
 from drivers import dmd
 from drivers.base.device import Context
 from drivers.clock import Clock

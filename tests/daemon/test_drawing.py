@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon import patterns
-from daemon.drawing import draw
+from daemon.scans.drawing import draw
 from daemon.scans.method import Unsuitable
 from protocol.patterns import Checker, RandomPhase
 from protocol.scans.anyscan import AnyScan

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.durable import StorageError, atomic_write, fsync_folder, storage
+from daemon.storage.durable import StorageError, atomic_write, fsync_folder, storage
 from protocol.errors import Code
 
 

@@ -15,19 +15,19 @@ import pytest
 
 from daemon import config
 from daemon.config import SequencerSection
-from daemon.control import Control
-from daemon.devicethread import Revoked, Session
+from daemon.devices.devicethread import Revoked, Session
+from daemon.devices.lightmeter import LightMeter, require_meterable
+from daemon.devices.rig import Rig
 from daemon.exposing.apparatus import Apparatus
+from daemon.exposing.control import Control
 from daemon.exposing.modes import Choice, Mode
+from daemon.exposing.recorder import Exposed, Recorder
+from daemon.exposing.ring import Ring
+from daemon.exposing.sequencer import Sequencer, exposer_for
 from daemon.exposing.video import Video
-from daemon.lightmeter import LightMeter, require_meterable
-from daemon.recorder import Exposed, Recorder
-from daemon.rig import Rig
-from daemon.ring import Ring
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Circle, Method, Unsuitable, Watch
 from daemon.scans.pattern_scan import response_of
-from daemon.sequencer import Sequencer, exposer_for
 from drivers.base.camera import CameraSettings
 from drivers.clock import NS, Clock
 from protocol.messages.runs import RunState
@@ -303,7 +303,7 @@ def watch(stand: Stand, frames: int) -> Watched:
 def test_a_pause_that_is_over_at_once_leaves_the_stage_moving(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from daemon.motion import Mover
+    from daemon.exposing.motion import Mover
 
     ended = Mover.end
 

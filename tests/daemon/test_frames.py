@@ -11,9 +11,9 @@ import pytest
 import zarr
 from numpy.typing import NDArray
 
-from daemon.durable import Damaged, StorageError
-from daemon.frames import FrameRecord, FrameStore, NoPixels
 from daemon.separation.estimator import Lighting, Observation
+from daemon.storage.durable import Damaged, StorageError
+from daemon.storage.frames import FrameRecord, FrameStore, NoPixels
 from protocol.patterns import Checker
 
 SHAPE = (37, 11)
@@ -240,7 +240,7 @@ WRITER = """
 import sys
 from pathlib import Path
 import numpy as np
-from daemon.frames import FrameRecord, FrameStore
+from daemon.storage.frames import FrameRecord, FrameStore
 from daemon.separation.estimator import Observation
 
 store = FrameStore.create(Path(sys.argv[1]), (512, 512), "uint16")

@@ -68,11 +68,11 @@ def test_a_missing_pattern_tells_nothing() -> None:
     weights = shift_weights(shifts, 16)
     assert weights is not None
     sums = WaveSums(weights)
-    for index in range(24):
+    for index in range(19):
         sums.add(np.zeros((4, 4), np.uint16), index)
     assert sums.waves() is None
-    sums.add(np.zeros((4, 4), np.uint16), 24)
-    assert sums.waves() is not None
+    sums.add(np.zeros((4, 4), np.uint16), 19)
+    assert sums.waves() is not None, "the last row of shifts is not needed"
     sums.add(np.zeros((4, 4), np.uint16), 3)
     assert sums.waves() is None, "a pattern that came twice"
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.durable import Damaged, StorageError
-from daemon.journal import Journal, read
+from daemon.storage.durable import Damaged, StorageError
+from daemon.storage.journal import Journal, read
 from protocol.errors import Code
 
 
@@ -97,6 +97,26 @@ def test_a_full_disk_takes_nothing_and_can_be_tried_again(
     assert caught.value.code is Code.STORAGE_FULL
     assert path.read_bytes().count(b"\n") == 1
     assert path.read_bytes().endswith(b"\n"), "the half line is taken back"
+    journal.commit()
+    assert numbers(path) == [1, 2]
+
+
+def test_a_disk_that_is_found_full_by_fsync_can_be_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "j.jsonl"
+    write(path, 1)
+    journal = Journal(path)
+    journal.append(Line(2))
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(StorageError):
+            journal.commit()
+    assert numbers(path) == [1], "what was not acknowledged is not there"
     journal.commit()
     assert numbers(path) == [1, 2]
 

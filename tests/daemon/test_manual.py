@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-import daemon.manual
+import daemon.manual.manual
 from daemon import config
-from daemon.manual import Manual
-from daemon.rig import Rig
+from daemon.devices.rig import Rig
+from daemon.devices.snapshot import snap
+from daemon.manual.manual import Manual
+from daemon.pictures.viewfinder import Viewfinder
 from daemon.scans.pattern_scan import response_of
-from daemon.snapshot import snap
-from daemon.viewfinder import Viewfinder
 from drivers.base.camera import CameraSettings
 from protocol.patterns import WHITE
 from protocol.scans.spec import Radiometry
@@ -56,7 +56,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch, act: Any) -> None:
             acts.pop()()
         return found
 
-    monkeypatch.setattr(daemon.manual, "snap", taken)
+    monkeypatch.setattr(daemon.manual.manual, "snap", taken)
 
 
 def test_after_a_snap_the_rig_is_free(manual: Manual) -> None:

@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from daemon import config
-from daemon.manual import Manual
-from daemon.manualstage import ManualStage
-from daemon.rig import Rig
-from daemon.viewfinder import Viewfinder
-from drivers.base.errors import DeviceRefused
+from daemon.devices.rig import Rig
+from daemon.manual.manual import Manual
+from daemon.manual.manualstage import ManualStage
+from daemon.pictures.viewfinder import Viewfinder
+from drivers.base.errors import DeviceLost, DeviceRefused
 from protocol.errors import UmbraError
 from protocol.messages.events import StageChanged
-from protocol.messages.rig import StageState
+from protocol.messages.rig import Health, StageState
 
 RIG = """
 [rig]
@@ -101,3 +101,16 @@ def test_homing_is_ended_by_stop_only(stage: ManualStage) -> None:
         with pytest.raises(UmbraError, match="homing: wait for its end, or `umbra stage stop`"):
             other()
     assert stage.stop().state is StageState.UNKNOWN
+
+
+def test_a_stage_that_is_lost_meanwhile_is_known_to_be(stage: ManualStage) -> None:
+    """By whichever call notices it; else it was never connected again while a circle went on."""
+    thread = stage._thread
+    thread.device.faults.inject("vanish", act="stop")  # type: ignore[attr-defined]
+    stage.circle((200.0, 150.0), 10.0, 100.0, None)
+    with pytest.raises(DeviceLost):
+        stage.stop()
+    assert stage._rig.devices()[0].health is Health.LOST
+    with pytest.raises(DeviceLost):
+        thread.call(lambda s: s.connect(), 60.0)
+    thread.call(lambda s: s.connect(), 60.0)  # as the rig does now

@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon import measured
-from daemon.plot import as_csv, as_svg
-from daemon.runfolder import RunFolder
+from daemon.products import measured
+from daemon.products.plot import as_csv, as_svg
 from daemon.separation.estimator import Curve, Measurement, Plot
-from daemon.store import Store
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import Store
 from protocol.scans.calibrations import CalibrateLeak
 
 X = np.asarray([1.0, 2.0, 4.0, 8.0])

@@ -114,7 +114,6 @@ def test_the_camera_as_it_is_set_bounds_the_feed() -> None:
     ("spec", "bench", "said"),
     [
         (KNOWN, replace(RIG, stage=None), "needs a stage"),
-        (Mesh(), RIG, "hole fraction"),
         (Mesh(hole_fraction=0.3), RIG, "circle's radius"),
         (Mesh(hole_mm=5.0), RIG, "go together"),
         (Mesh(hole_mm=12.0, pitch_mm=10.0), RIG, "run into each other"),

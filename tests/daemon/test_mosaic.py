@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Observation
-from daemon.separation.extremes import MaxMin
-from daemon.separation.mosaic import colour_masks, demosaic
+from daemon.separation.extremes import Extremes
+from daemon.separation.mosaic import colour_masks, demosaic, orders_of
 from daemon.separation.radiometry import Response
 
 ORDERS = ["RG", "GR", "GB", "BG"]
@@ -69,8 +69,8 @@ def test_separating_raw_agrees_with_separating_colours(bayer: str) -> None:
     smooth = np.stack([np.sin(x / 25) + 2, np.cos(y / 20) + 2, np.sin((x + y) / 30) + 2], axis=2)
     direct, indirect = 8000 * smooth, 5000 * smooth[::-1]
     lit = (x // 8 + y // 8) % 2 == 0
-    raw = MaxMin(Response(full_scale=65535, bayer=bayer), lit_fraction=0.5, leakage=0.0)
-    colour = MaxMin(Response(full_scale=65535), lit_fraction=0.5, leakage=0.0)
+    raw = Extremes(Response(full_scale=65535, bayer=bayer), lit_fraction=0.5, leakage=0.0)
+    colour = Extremes(Response(full_scale=65535), lit_fraction=0.5, leakage=0.0)
     for index, shade in enumerate((lit, ~lit)):
         light = direct * shade[..., None] + 0.5 * indirect
         colour.update(np.rint(light).astype(np.uint16), Observation(pattern=index))
@@ -86,3 +86,22 @@ def test_opencv_cannot_do_it() -> None:
     """Why this exists: should OpenCV learn float32, its result is to be compared with ours."""
     with pytest.raises(cv2.error):
         cv2.cvtColor(np.ones((8, 8), dtype=np.float32), cv2.COLOR_BayerRG2RGB)
+
+
+@pytest.mark.parametrize("bayer", ["RG", "GR", "GB", "BG"])
+@pytest.mark.parametrize("colours", [(0.8, 1.0, 0.9), (0.7, 1.0, 0.7), (1.0, 0.9, 0.6)])
+def test_a_mosaic_is_known_by_its_greens(bayer: str, colours: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(3)
+    grey = rng.uniform(0.2, 1.0, (24, 32)).repeat(5, axis=0).repeat(5, axis=1)
+    grey *= rng.normal(1.0, 0.05, grey.shape)
+    masks = colour_masks((120, 160), bayer)
+    mosaic = np.einsum("cyx,yx,c->yx", masks, grey, np.asarray(colours))
+    found = orders_of(np.rint(4000 * mosaic).astype(np.uint16))
+    assert bayer in found
+    assert len(found) == 2
+    assert not orders_of(np.rint(4000 * grey).astype(np.uint16))
+
+
+def test_a_fine_grating_is_no_mosaic() -> None:
+    grating = np.where(np.arange(96) % 2, 900, 500)[None, :].repeat(64, axis=0)
+    assert not orders_of(grating.astype(np.uint16))

@@ -7,9 +7,9 @@ import threading
 import msgspec
 import pytest
 
-from daemon.control import Control
-from daemon.devicethread import Revoked, Session
-from daemon.preconditions import LightWatch, Precondition, Preconditions
+from daemon.devices.devicethread import Revoked, Session
+from daemon.exposing.control import Control
+from daemon.runs.preconditions import LightWatch, Precondition, Preconditions
 from daemon.separation.metering import Level
 from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.clock import NS, Clock
@@ -135,6 +135,17 @@ def test_what_will_not_mend_itself_ends_at_once() -> None:
     with pytest.raises(DeviceRefused):
         bench.wait(bench.until(1, DeviceRefused("stage", "scan", "it is in alarm")))
     assert bench.clock.seconds == 0
+
+
+def test_what_somebody_may_mend_is_waited_for() -> None:
+    bench = Bench(Ready(deadline_s=100.0, look_s=10.0))
+
+    def alarm() -> None:
+        if bench.clock.seconds < 30:
+            raise DeviceRefused("stage", "scan", "it is in alarm", "look at it")
+
+    assert bench.wait(Precondition("stage", alarm, mended=True)) == 30.0
+    assert "in alarm; look at it" in bench.told[0].seen
 
 
 def test_an_end_ends_the_wait() -> None:

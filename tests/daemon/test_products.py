@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon import products, staging
-from daemon.display import UNMEASURED, common_white, for_display, thumbnail
-from daemon.durable import Damaged, StorageError
-from daemon.frames import FrameRecord, FrameStore
-from daemon.quality import BITS, overlay
-from daemon.runfolder import RunFolder
+from daemon.pictures.display import UNMEASURED, common_white, for_display, thumbnail
+from daemon.products import separated
+from daemon.products.quality import BITS, overlay
 from daemon.separation.estimator import Components, Observation, Quality
-from daemon.store import Store
+from daemon.storage import staging
+from daemon.storage.durable import Damaged, StorageError
+from daemon.storage.frames import FrameRecord, FrameStore
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import Store
 from drivers.base.pixelformat import PixelFormat
 from protocol.errors import Code, UmbraError
 from protocol.scans.projected import Checkerboard
@@ -44,7 +45,7 @@ def components(colour: bool = True) -> Components:
 
 
 def write(run: RunFolder, made: Components, **more: Any) -> dict[str, Path]:
-    written = products.write(run, made, full_scale=1023, **more)
+    written = separated.write(run, made, full_scale=1023, **more)
     run.add_products(written)
     for product in written:
         assert (run.path / product.file).stat().st_size == product.bytes > 0
@@ -58,7 +59,7 @@ def test_components_come_back_bit_by_bit(run: RunFolder, colour: bool) -> None:
     assert set(files) == {
         "direct", "global", "coverage", "quality", "facts", "preview", "report",
     }  # fmt: skip
-    again, facts = products.read(run)
+    again, facts = separated.read(run)
     np.testing.assert_array_equal(again.direct, made.direct)
     np.testing.assert_array_equal(again.global_, made.global_)
     np.testing.assert_array_equal(again.quality, made.quality)
@@ -101,14 +102,14 @@ def test_truth_is_compared_over_good_and_over_all_pixels(run: RunFolder) -> None
     assert found["rmse_global"] == 0
     assert found["rmse_global_all"] == pytest.approx(0.1 / np.sqrt(24 * 32), rel=1e-4)
     with pytest.raises(ValueError, match="true direct has shape"):
-        products.compare(made, {"direct": made.direct[:5], "global": made.global_}, 1023)
+        separated.compare(made, {"direct": made.direct[:5], "global": made.global_}, 1023)
 
 
 def test_truth_with_no_comparable_pixel_is_none() -> None:
     made = components()
     made.quality[...] |= np.uint16(Quality.MOVED)
     truth = {"direct": made.direct, "global": made.global_}
-    found = products.compare(made, truth, 1023)
+    found = separated.compare(made, truth, 1023)
     assert found["rmse_direct"] is None
     assert found["rmse_direct_all"] == 0
 
@@ -127,7 +128,7 @@ def test_a_failed_write_leaves_the_earlier_products(
     second = components()
     second.direct[...] = 1
     with pytest.raises(StorageError) as caught:
-        products.write(run, second, full_scale=1023)
+        separated.write(run, second, full_scale=1023)
     assert caught.value.code is Code.STORAGE_FULL
     assert {n: run.product(n).read_bytes() for n in before} == before
     assert not list(run.path.glob(".products-*"))
@@ -143,12 +144,12 @@ def test_what_a_crash_left_is_swept_up(run: RunFolder) -> None:
 
 def test_reading_names_what_is_missing_or_spoilt(run: RunFolder) -> None:
     with pytest.raises(UmbraError, match="has made no separation") as caught:
-        products.read(run)
+        separated.read(run)
     assert caught.value.code is Code.NO_RESULT
     files = write(run, components())
     files["global"].write_bytes(b"II*\0")
     with pytest.raises(Damaged, match=r"global\.tiff"):
-        products.read(run)
+        separated.read(run)
 
 
 def test_the_preview_shows_the_white_frame_that_was_recorded(run: RunFolder) -> None:

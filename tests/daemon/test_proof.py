@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.exposing.proof import Proof, head_problem, look_of
 from daemon.patterns import render
-from daemon.proof import Proof, head_problem, look_of
 from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting
 from protocol.patterns import BLACK, WHITE, AnyPattern, Checker, GrayCode, Solid

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-import daemon.frames
-import daemon.journal
-from daemon.durable import StorageError
-from daemon.frames import FrameStore
-from daemon.recorder import Exposed, Recorder
-from daemon.ring import Ring
+import daemon.storage.frames
+import daemon.storage.journal
+from daemon.exposing.recorder import Exposed, Recorder
+from daemon.exposing.ring import Ring
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
 from daemon.separation.estimator import NotYet
+from daemon.storage.durable import StorageError
+from daemon.storage.frames import FrameStore
 from drivers.base.camera import CameraInfo, Frame
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
@@ -28,18 +28,21 @@ CAMERA = CameraInfo(SHAPE[1], SHAPE[0], PixelFormat.MONO8)
 
 
 class Disk:
-    """Writes that fail while it is full: of shards, or of the lines that acknowledge them."""
+    """Writes that fail while it is full: of shards, or of the lines that acknowledge them. An fsync
+    that fails has dropped what was written."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, full: dict[str, int]) -> None:
         self.full = full
         for name in full:
-            place = daemon.journal if name == "_write_at" else daemon.frames
+            place = daemon.storage.journal if name == "_write_at" else daemon.storage.frames
             monkeypatch.setattr(place, name, self._failing(name, getattr(place, name)))
 
     def _failing(self, name: str, real: Any) -> Any:
         def write(*args: Any, **options: Any) -> Any:
             if self.full.get(name, 0) > 0:
                 self.full[name] -= 1
+                if name == "fsync_file":
+                    args[0].write_bytes(b"")
                 raise OSError(errno.ENOSPC, "No space left on device")
             return real(*args, **options)
 
@@ -84,7 +87,7 @@ def store(folder: Path) -> FrameStore:
     return FrameStore.create(folder, SHAPE, np.uint8)
 
 
-@pytest.mark.parametrize("what", ["_write", "atomic_write", "_write_at"])
+@pytest.mark.parametrize("what", ["_write", "fsync_file", "atomic_write", "_write_at"])
 def test_what_the_disk_refused_is_written_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
@@ -121,10 +124,10 @@ def test_after_a_failed_fsync_nothing_is_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(path: Path) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        raise OSError(errno.EIO, "Input/output error", str(path))
 
-    course, frames = Course(), store(tmp_path / "full")
-    monkeypatch.setattr(daemon.frames, "fsync_file", fail)
+    course, frames = Course(), store(tmp_path / "broken")
+    monkeypatch.setattr(daemon.storage.frames, "fsync_file", fail)
     recorder = record(frames, course)
     with pytest.raises(StorageError):
         recorder.finish()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -15,7 +16,11 @@ from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Taken, Watch
 from daemon.separation.estimator import Components, Observation
 from daemon.separation.radiometry import Response
-from daemon.separation.registration import LEAST_PX, REFERENCE, Registration
+from daemon.separation.registration import (
+    LEAST_PX,
+    REFERENCE,
+    Registration,
+)
 from daemon.separation.warping import aligned, beyond, uncertain, without
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
@@ -48,18 +53,23 @@ def seen(plane: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
     return np.asarray(part.reshape(HEIGHT, 2, WIDTH, 2).mean((1, 3)), np.float64)
 
 
+@lru_cache(maxsize=TURN)
+def light(k: int) -> NDArray[np.float64]:
+    """What comes through the mesh at one of the TURN places of its circle, at half pixels."""
+    y, x = np.mgrid[0 : 2 * (HEIGHT + 2 * SPAN), 0 : 2 * (WIDTH + 2 * SPAN)] / 2.0
+    angle = math.tau * k / TURN
+    away = 0.95 * PITCH
+    clear = HOLES.clearance(x + away * math.cos(angle), y + away * math.sin(angle))
+    return np.asarray(24000.0 * np.clip(clear + 0.5, 0, 1) + 0.3 * 9000.0)
+
+
 def frames(shifts: Shifts, texture: float = 0.3, noise: float = 200.0) -> list[NDArray[Any]]:
     """The wall behind a mesh on its circle, by a camera that is shifted frame by frame."""
     rng = np.random.default_rng(6)
     albedo = wall(texture)
-    y, x = np.mgrid[0 : albedo.shape[0], 0 : albedo.shape[1]] / 2.0
     found = []
     for k, (dx, dy) in enumerate(shifts):
-        angle = math.tau * k / TURN
-        away = 0.95 * PITCH
-        clear = HOLES.clearance(x + away * math.cos(angle), y + away * math.sin(angle))
-        light = albedo * (24000.0 * np.clip(clear + 0.5, 0, 1) + 0.3 * 9000.0)
-        picture = seen(light, dx, dy) + rng.normal(0, noise, (HEIGHT, WIDTH))
+        picture = seen(albedo * light(k % TURN), dx, dy) + rng.normal(0, noise, (HEIGHT, WIDTH))
         found.append(np.rint(np.clip(picture, 0, 65535)).astype(np.uint16))
     return found
 

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.frames import FrameRecord
-from daemon.report import separation as report
-from daemon.runfolder import RunFile
+from daemon.products.report import separation as report
 from daemon.separation.estimator import Observation
+from daemon.storage.frames import FrameRecord
+from daemon.storage.runfolder import RunFile
 from protocol.messages.runs import Product, RunState
 from protocol.scans.anyscan import AnyScan
 from protocol.scans.occluded import Mesh, Stick

@@ -15,15 +15,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon import aftermath, config, products
-from daemon.frames import FrameRecord, FrameStore
-from daemon.reprocessing import Reprocessing, method_of
-from daemon.reprocessor import Reprocessor
-from daemon.runfolder import RunFolder
+from daemon import config
+from daemon.products import separated
+from daemon.runs import aftermath
+from daemon.runs.reprocessing import Reprocessing, method_of
+from daemon.runs.reprocessor import Reprocessor
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, Observation
-from daemon.store import Store
+from daemon.storage.frames import FrameRecord, FrameStore
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import Store
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
@@ -121,7 +123,7 @@ def parent_of(
     kept.close()
     result = estimator.result()
     assert isinstance(result, Components)
-    made = products.write(
+    made = separated.write(
         run,
         method.conclude(result),
         full_scale=camera.pixel_format.full_scale,

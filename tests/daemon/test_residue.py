@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from daemon.separation.estimator import Components, Quality
 from daemon.separation.fineness import astray, finer_pattern
+from daemon.separation.straddling import as_neighbours
 from protocol.patterns import Axis
 from protocol.scans.anyscan import AnySeparation
 from protocol.scans.projected import (
@@ -116,13 +117,37 @@ def test_a_pattern_finer_one_way_only_is_a_slanted_surface() -> None:
     assert not found[slanted].any()
 
 
-def test_the_edges_of_two_images_are_flagged_and_the_rest_is_right() -> None:
+@pytest.mark.parametrize("spec", [TwoImage(radiometry=LIGHT), RandomPhase(radiometry=LIGHT)])
+def test_the_edges_of_a_pattern_are_flagged_and_split_as_their_neighbours(
+    spec: AnySeparation,
+) -> None:
     scene = Scene(sigma=0.004, leakage=0.06, blur=0.6)
-    found = scene.scan(TwoImage(radiometry=LIGHT))
-    off = np.abs(found.direct - scene.direct) / scene.direct
-    flagged = (found.quality & np.uint16(Quality.LOW_MODULATION)) != 0
-    assert np.mean(flagged) < 0.5
-    assert np.mean(off[~flagged] < 0.2) > 0.99
-    assert np.mean(flagged[off > 0.2]) > 0.95
-    assert np.mean(off[flagged] > 0.1) > 0.9
-    assert found.facts["straddling"] == pytest.approx(float(np.mean(flagged)), abs=0.01)
+    found = scene.scan(spec)
+    off = np.abs(found.direct - scene.direct)
+    flagged = (found.quality & np.uint16(Quality.EDGE)) != 0
+    assert 0.2 < np.mean(flagged) < 0.7
+    assert found.facts["edges"] == pytest.approx(float(np.mean(flagged)), abs=0.01)
+    assert np.mean(off[flagged] / scene.direct[flagged] < 0.2) > 0.99  # by Eq. 8: one in ten
+    assert np.mean(off / scene.direct < 0.2) > 0.97
+    stated = found.planes["direct_std"]
+    assert 0.5 < np.median((off / stated)[flagged]) / 0.6745 < 1.25
+
+
+@pytest.mark.parametrize("mosaic", [False, True])
+def test_an_edge_has_its_neighbours_part_of_its_own_light(mosaic: bool) -> None:
+    rng = np.random.default_rng(3)
+    light = rng.uniform(1000, 3000, (32, 48)).astype(np.float32)
+    part = np.full(light.shape, 0.7, np.float32)
+    if mosaic:
+        part[::2, ::2] = 0.4  # of a colour
+    edge = np.zeros(light.shape, np.bool_)
+    edge[10:13] = True
+    less = np.where(edge, part * 0.2, part) * light
+    noise = np.full_like(light, 5.0)
+    split = as_neighbours(less, light, noise, edge, mosaic=mosaic)
+    np.testing.assert_allclose(split.direct, part * light, rtol=1e-4)
+    assert np.array_equal(split.known, edge)
+    assert not split.deviation[20:].any()
+    nowhere = as_neighbours(less, light, noise, np.ones_like(edge), mosaic=mosaic)
+    assert not nowhere.known.any()
+    np.testing.assert_array_equal(nowhere.direct, less)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from daemon import config
-from daemon.rig import Rig
+from daemon.devices.rig import Rig
 from drivers.base.errors import DeviceLost
 from protocol.messages.rig import DeviceInfo, Health
 

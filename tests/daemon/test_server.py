@@ -12,7 +12,7 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from daemon.server import Answer, Caller, Server
+from daemon.serving.server import Answer, Caller, Server
 from drivers.base.errors import DeviceLost
 from protocol import wire
 from protocol.errors import Code, UmbraError
@@ -135,6 +135,7 @@ async def test_another_version_is_told_both(desk: Desk) -> None:
         ([b'{"id":"short","protocol":1,"command":{"type":"dark"}}'], "$.id"),
         ([b'{"id":"abcdefgh","protocol":1,"command":{"type":"dark"}}', b"stray"], "$.arrays"),
         ([b"{" * 100_000], ""),
+        ([b'{"id":"abcdefgh","protocol":1,"command":' + b"[" * 100_000], ""),
     ],
 )
 async def test_garbage_is_answered(desk: Desk, parts: list[bytes], where: str) -> None:

@@ -231,3 +231,15 @@ def test_phases_declared_wrongly_are_told_of() -> None:
         advice[phases] = estimator.result().facts["advice"]
     assert advice[8] == [UNCHECKED]
     assert "--phases" in advice[4][0]
+
+
+def test_a_blur_that_is_not_known_is_in_the_deviation() -> None:
+    """Frames with next to no noise: what blur takes of plain stripes is the whole error."""
+    scene = Scene(sigma=0.0002, blur=0.8)
+    one = scene.scan(Spec(weave=0.0, phases=8))
+    two = scene.scan(Spec(weave=0.0, phases=8, periods=(12.0, 16.0)))
+    for found, least in ((one, 0.02), (two, 0.002)):
+        off = np.abs(found.direct - scene.direct)[8:-8, 8:-8]
+        stated = found.planes["direct_std"][8:-8, 8:-8]
+        assert np.median(stated) > least * np.median(found.direct)
+        assert np.median(off / stated) < 2.0

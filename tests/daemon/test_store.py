@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.durable import Damaged
-from daemon.frames import FrameRecord, FrameStore
-from daemon.runfolder import RunFolder
 from daemon.separation.estimator import Observation
-from daemon.store import DataFolderInUse, Store, estimate_bytes
+from daemon.storage.durable import Damaged
+from daemon.storage.frames import FrameRecord, FrameStore
+from daemon.storage.runfolder import RunFolder
+from daemon.storage.store import DataFolderInUse, Store, estimate_bytes
 from drivers.clock import RealClock
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import End, Product, RunState
@@ -133,9 +133,18 @@ def test_half_made_and_half_deleted_folders_are_swept_up(tmp_path: Path) -> None
     assert not half.exists()
 
 
+def test_somebodys_file_among_the_runs_is_left_alone(tmp_path: Path) -> None:
+    with Store(tmp_path):
+        (tmp_path / "runs" / ".DS_Store").write_bytes(b"x")
+        (tmp_path / "runs" / "notes.txt").write_bytes(b"x")
+    with Store(tmp_path) as store:
+        assert not store.damaged
+    assert (tmp_path / "runs" / ".DS_Store").exists()
+
+
 def test_two_daemons_never_share_a_folder(tmp_path: Path) -> None:
     code = (
-        "import sys, pathlib; from daemon.store import Store\n"
+        "import sys, pathlib; from daemon.storage.store import Store\n"
         "store = Store(pathlib.Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from daemon.separation.estimator import NotYet, Observation
+from daemon.separation.extremes import Extremes
 from daemon.separation.order_estimate import KEEP
-from daemon.separation.order_model import BLURS, RATIOS, fit, simulate
+from daemon.separation.order_model import BLURS, RATIOS, OrderModels
 from daemon.separation.radiometry import Response
-from daemon.separation.topk import TopK
 from protocol.scans.anyscan import AnyScan
 from protocol.scans.projected import Checkerboard, RandomBinary
 from protocol.scans.spec import Radiometry
@@ -22,6 +22,11 @@ def plain(blur: float) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
     """Twelve patterns that light a place in the first six, without edges."""
     del blur
     return np.repeat(np.arange(12)[:, None] < 6, 400, axis=1).astype(np.float32)
+
+
+def ranking(response: Response) -> Extremes:
+    """The five brightest and darkest of `plain` patterns, less their bias."""
+    return Extremes(response, lit_fraction=0.5, leakage=0.0, keep=KEEP, unbiased=True, levels=plain)
 
 
 def bias(spec: AnyScan, scene: Scene) -> tuple[float, float, float]:
@@ -80,7 +85,7 @@ def test_the_stated_deviation_is_that_of_repeated_scans() -> None:
 
 
 def test_black_where_every_count_is_zero_stays_black() -> None:
-    estimator = TopK(Response(full_scale=255), lit_fraction=0.5, leakage=0.0, levels=plain)
+    estimator = ranking(Response(full_scale=255))
     rng = np.random.default_rng(1)
     for index in range(12):
         frame = np.zeros((96, 128), dtype=np.uint8)
@@ -93,24 +98,25 @@ def test_black_where_every_count_is_zero_stays_black() -> None:
     assert not (found.direct < 0).any()
 
 
-def test_blur_and_noise_are_told_apart() -> None:
+def test_blur_is_told_where_noise_is_known() -> None:
     def levels(blur: float) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
         edge = np.random.default_rng(2).uniform(0.0, 6.0, (24, 800))
         lit = np.arange(24)[:, None] < 12
         soft = 0.5 + 0.5 * np.tanh(edge / max(blur, 1e-3))
         return np.where(lit, soft, 1 - soft).astype(np.float32)
 
-    models = simulate(levels, KEEP)
-    for blur, at in ((0, 5), (BLURS.index(1.4), 3)):
-        gaps = np.stack([models[blur].gaps[at]] * 4)
-        seen = np.full((1, 4, 2), RATIOS[at] / models[blur].step[at])
-        found, ratios, _, _ = fit(models, gaps, seen)
-        assert BLURS[found] == pytest.approx(BLURS[blur], abs=0.3)
-        np.testing.assert_allclose(ratios, RATIOS[at], rtol=0.15)
+    models = OrderModels(levels, KEEP)
+    for blur, at in ((0.0, 5), (1.4, 3)):
+        model = models._models[BLURS.index(blur)]
+        gaps = np.stack([model.gaps[at]] * 4)
+        seen = np.full((4, 2), RATIOS[at] / model.step[at])
+        place, amount = models.fit(gaps, seen)
+        assert models.at(place)[0] == pytest.approx(blur, abs=0.3)
+        assert amount == 1.0
 
 
 def test_before_there_are_ranks_the_extremes_stand() -> None:
-    estimator = TopK(Response(full_scale=255), lit_fraction=0.5, leakage=0.0, levels=plain)
+    estimator = ranking(Response(full_scale=255))
     estimator.update(np.full((4, 4), 30, dtype=np.uint8), Observation(pattern=0))
     with pytest.raises(NotYet, match="1 came"):
         estimator.result()
@@ -125,10 +131,7 @@ def test_before_there_are_ranks_the_extremes_stand() -> None:
 def test_a_resumed_ranking_gives_the_same_bits() -> None:
     rng = np.random.default_rng(3)
     frames = rng.integers(0, 65536, (12, 40, 48), dtype=np.uint16)
-    one, other = (
-        TopK(Response(full_scale=65535), lit_fraction=0.5, leakage=0.02, levels=plain)
-        for _ in range(2)
-    )
+    one, other = (ranking(Response(full_scale=65535)) for _ in range(2))
     for index, frame in enumerate(frames):
         one.update(frame, Observation(pattern=index))
         other.update(frame.copy(), Observation(pattern=index))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.viewfinder import Glimpse, Viewfinder, cells, saturation_of
+from daemon.pictures.viewfinder import Glimpse, Viewfinder, cells, saturation_of
 from drivers.base.camera import CameraInfo, Frame
 from drivers.base.pixelformat import PixelFormat
 

@@ -4,7 +4,7 @@ for what takes many scans."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -22,6 +22,7 @@ from drivers.virtual.geometry import Pinhole
 from drivers.virtual.scene import TARGET
 from drivers.virtual.transport import Transport, transport
 from drivers.virtual.view import View, view
+from protocol.patterns import AnyPattern
 from protocol.scans.anyscan import AnyScan
 from tests.daemon.scanning import scanned
 
@@ -42,6 +43,7 @@ class VirtualScene:
     level: float = 0.8  # of the scale, for radiance 1
     read: float = 1.2  # counts
     electrons: float = 10_500.0  # at full scale
+    _lit: dict[AnyPattern, NDArray[np.float32]] = field(default_factory=dict, init=False)
 
     @cached_property
     def operator(self) -> Transport:
@@ -77,7 +79,16 @@ class VirtualScene:
         """What the camera counts under a step's pattern."""
         light: NDArray[Any] = np.zeros((self.height, self.width), np.float32)
         if step.pattern is not None:
-            shown = patterns.render(step.pattern, self.width, self.height) / np.float32(255)
+            light = self._light(step.pattern)
+        counts = light * self.level * (FULL - BLACK) * ((step.exposure_us or OWN_US) / OWN_US)
+        shot = np.sqrt(np.maximum(counts, 0) * FULL / self.electrons)
+        noisy = counts + rng.standard_normal(counts.shape) * np.hypot(shot, self.read) + BLACK
+        return np.asarray(np.rint(np.clip(noisy, 0, FULL)), np.uint16)
+
+    def _light(self, pattern: AnyPattern) -> NDArray[np.float32]:
+        """Without noise, for radiance 1; kept for the next scan."""
+        if pattern not in self._lit:
+            shown = patterns.render(pattern, self.width, self.height) / np.float32(255)
             lit = self.leakage + (1 - self.leakage) * shown**self.gamma
             emitted = np.asarray(lit, np.float32)
             if self.defocus:
@@ -85,11 +96,8 @@ class VirtualScene:
                     emitted, (0, 0), self.defocus, borderType=cv2.BORDER_REPLICATE
                 )
                 emitted = np.asarray(blurred, np.float32)
-            light = np.add(*self.operator.render(self.operator.light(emitted), "RG"))
-        counts = light * self.level * (FULL - BLACK) * ((step.exposure_us or OWN_US) / OWN_US)
-        shot = np.sqrt(np.maximum(counts, 0) * FULL / self.electrons)
-        noisy = counts + rng.standard_normal(counts.shape) * np.hypot(shot, self.read) + BLACK
-        return np.asarray(np.rint(np.clip(noisy, 0, FULL)), np.uint16)
+            self._lit[pattern] = np.add(*self.operator.render(self.operator.light(emitted), "RG"))
+        return self._lit[pattern]
 
     def scan(self, spec: AnyScan, seed: int = 1) -> Components:
         """The whole of a scan, as the daemon does it."""

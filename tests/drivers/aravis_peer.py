@@ -5,15 +5,19 @@
 Aravis's own program knows 8 and 16 bit only. This one runs the same camera, protocol and all, gives
 it three more pixel formats, and fills its buffers. Its mosaic begins with R and G wherever the
 region begins, as the fake's own does: the name of the format says what a frame begins with.
-FILM is an .npy of pictures (N, H, W) that it sees instead, one a frame.
+FILM is an .npy of pictures (N, H, W) that it sees instead, one a frame. It says "ready" when it is.
 """
 
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import itertools
+import os
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +26,14 @@ from numpy.typing import NDArray
 
 FORMATS = {"BayerRG12": 0x01100011, "BayerRG12p": 0x010C0059, "BayerRG12Packed": 0x010C002B}
 WIDTH, HEIGHT, OFFSET_X, OFFSET_Y = 0x100, 0x104, 0x130, 0x134  # the fake camera's registers
+
+
+@contextmanager
+def loopback() -> Iterator[None]:
+    """The one address that a fake camera can have, for one test on this machine at a time."""
+    with Path(f"/tmp/umbra-tests-aravis-{os.getuid()}").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def sensor(x: int, y: int, width: int, height: int) -> NDArray[np.uint16]:
@@ -83,6 +95,7 @@ def serve(address: str, serial: str, folder: Path, film: str = "") -> None:
     library.arv_fake_camera_set_fill_pattern(
         ctypes.c_void_p(hash(fake)), kept, ctypes.c_void_p(None)
     )
+    print("ready", flush=True)
     GLib.MainLoop().run()
 
 

@@ -77,9 +77,10 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
-    made = Bench()
-    yield made
-    made.cut()
+    with aravis_peer.loopback():
+        made = Bench()
+        yield made
+        made.cut()
 
 
 @pytest.fixture

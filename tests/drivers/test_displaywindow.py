@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.devicethread import DeviceThread
+from daemon.devices.devicethread import DeviceThread
 from drivers.base.device import Context
 from drivers.base.errors import DeviceLost, DeviceRefused
 from tests.drivers.xserver import screenshot, xvfb

@@ -13,7 +13,7 @@ import pytest
 import usb.core
 from numpy.typing import NDArray
 
-from drivers import dlpc350, dlpc_hid, dmd
+from drivers import dlpc350, dlpc350_board, dlpc_hid, dmd
 from drivers import dlpc350_protocol as p
 from drivers.base.device import Context
 from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
@@ -474,7 +474,7 @@ def hdmi(
 
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
     monkeypatch.setenv("DISPLAY", server)
-    monkeypatch.setattr(dlpc350, "POLL_S", 0.001)
+    monkeypatch.setattr(dlpc350_board, "POLL_S", 0.001)
     board.video = lambda: screenshot(server)
     device = make(RealClock(), flash=[], display={"latency_frames": 1.0}, layout="square")
     device.connect()

@@ -78,6 +78,6 @@ def rig(fake: FakeRig, connect: Callable[..., Client]) -> Iterator[Client]:
 
 @pytest.fixture
 def hasty(fake: FakeRig, connect: Callable[..., Client]) -> Iterator[Client]:
-    """A client that asks again after 0.1 s."""
-    with connect(fake.endpoint, name="me", timeout_s=0.3) as client:
+    """A client that asks again after 0.5 s: by then an answer that was given is here."""
+    with connect(fake.endpoint, name="me", timeout_s=1.5) as client:
         yield client

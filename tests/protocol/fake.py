@@ -281,6 +281,9 @@ class FakeRig:
                 return reply, {"data": part}
             case commands.GetLog():
                 return replies.Log(records=({"event": "hello"},)), {}
+            case commands.Draw():
+                facts = {"images": 27, "lighting": "black"}
+                return replies.Picture(facts=facts), {"png": np.zeros(8, np.uint8)}
             case commands.GetPreview() | commands.Snap():
                 name = "preview" if isinstance(command, commands.GetPreview) else "frame"
                 return replies.Picture(facts={"saturated": 0}), {

@@ -389,7 +389,7 @@ def test_steering_without_a_run_names_the_one_it_means(rig: Rig) -> None:
 
 def test_get_fetches_all_products(rig: Rig, tmp_path: Path, capsys: Captured) -> None:
     rig.make("direct", "global")
-    out = tmp_path / "new" / "out"
+    out = tmp_path / "out"
     assert run(["get", "-o", str(out)]) == Exit.OK
     assert {p.name: p.read_bytes() for p in out.iterdir()} == {
         f"{name}.tiff": data for name, data in rig.files.items()

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from protocol.cli.delivery import Delivery
+from protocol.cli.delivery import Delivery, make_folder
 from protocol.cli.picture import in_terminal, png
 from protocol.cli.private import configured, toml
 from protocol.cli.separate import as_typed
@@ -28,12 +28,18 @@ def deliver(folder: Path, *, force: bool = False, fail: bool = False) -> None:
 
 
 def test_a_new_folder_appears_whole(tmp_path: Path) -> None:
-    deliver(tmp_path / "a" / "b")
-    assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == [
-        "direct.tiff",
-        "global.tiff",
-    ]
-    assert [p.name for p in (tmp_path / "a").iterdir()] == ["b"]
+    deliver(tmp_path / "a")
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["direct.tiff", "global.tiff"]
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_folders_parents_are_not_made(tmp_path: Path) -> None:
+    """A mistyped path must not become a tree of folders."""
+    with pytest.raises(UmbraError, match=r"there is no folder .*/reslts to make today in"):
+        Delivery(tmp_path / "reslts" / "today").check()
+    with pytest.raises(UmbraError, match=r"cannot make .*today: No such file"):
+        make_folder(tmp_path / "reslts" / "today")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_an_existing_folder_keeps_its_other_files(tmp_path: Path) -> None:
@@ -62,7 +68,7 @@ def test_products_are_not_overwritten_without_force(tmp_path: Path) -> None:
     assert (tmp_path / "global.tiff").read_bytes() == b"new"
 
 
-@pytest.mark.parametrize("below", [".", "new", "new/er"])
+@pytest.mark.parametrize("below", [".", "new"])
 def test_a_read_only_folder_is_refused_whoever_asks(below: str, tmp_path: Path) -> None:
     tmp_path.chmod(0o555)
     try:
@@ -115,6 +121,11 @@ def test_a_picture_without_24_bit_colour(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "\x1b[38;5;239m" in in_terminal(pixels, 2, 1)
 
 
+def test_tables_of_one_name_are_read_back() -> None:
+    lights = [{"name": "lamp", "driver": "virtual"}, {"name": "sun", "driver": "virtual"}]
+    assert tomllib.loads(toml({"light": lights, "rig": {"name": "x"}}))["light"] == lights
+
+
 def test_toml_is_read_back() -> None:
     tables = {
         "camera": {"path": 'a "b"\\c\n\x7f é 📷', "first": ["x", "y"], "n": 3, "on": True},
@@ -150,5 +161,5 @@ def test_what_a_quick_command_does_not_import(arguments: list[str], absent: list
 
 
 def test_a_recordings_keys_are_named_as_they_were_typed() -> None:
-    said = as_typed("no images that match 'x*'; check `path` and `match`, leave `bits` out")
-    assert said == "no images that match 'x*'; check DIR and --match, leave `bits` out"
+    said = as_typed("no images that match 'x*'; check `path` and `match`, leave `loop` out")
+    assert said == "no images that match 'x*'; check DIR and --match, leave `loop` out"

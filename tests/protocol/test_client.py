@@ -68,6 +68,7 @@ def test_each_command_has_a_method_and_the_answer_it_names(fake: FakeRig, rig: C
     assert bytes(rig.product_part(run.id, "direct", 1).data) == b"bc"
     assert rig.log() == ({"event": "hello"},)
     assert rig.preview().pixels.shape == rig.snap().pixels.shape == (4, 4, 3)
+    assert rig.draw(Checkerboard(), 0, 64, 48).facts["images"] == 27
     assert rig.camera(gain=2.0).gain == 2.0
     assert rig.stage() == rig.stage_home() == rig.stage_move(1, 2, 3) == STAGE
     assert rig.stage_circle((9, 9), 3, 2) == rig.stage_stop() == rig.stage_unlock() == STAGE
@@ -83,6 +84,11 @@ def test_each_command_has_a_method_and_the_answer_it_names(fake: FakeRig, rig: C
 def test_every_command_is_in_the_table_of_answers() -> None:
     assert set(replies.ANSWERS) == set(commands.AnyCommand.__args__)
     assert set(replies.ANSWERS.values()) <= set(replies.AnyReply.__args__)
+
+
+def test_a_request_that_is_too_large_is_not_sent(rig: Client) -> None:
+    with pytest.raises(UmbraError, match=r"the request has 5\.0 MB, at most 4\.2 are taken"):
+        rig.submit(Checkerboard(note="n" * 5_000_000))
 
 
 def test_methods_show_their_signature_and_docstring(fake: FakeRig) -> None:

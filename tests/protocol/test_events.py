@@ -224,7 +224,7 @@ def test_silence_is_mended_by_a_snapshot(fake: FakeRig, rig: Client) -> None:
 def test_a_rig_that_vanishes_is_noticed() -> None:
     with contextlib.ExitStack() as stack:
         fake = stack.enter_context(FakeRig())
-        with Client(fake.endpoint, timeout_s=0.3) as rig:
+        with Client(fake.endpoint, timeout_s=1.5) as rig:
             progress = rig.scan(Checkerboard()).progress()
             next(progress)
             stack.close()

@@ -54,6 +54,8 @@ def test_changes_are_put_where_they_belong() -> None:
     assert changed(spec, {}) == spec
     assert changed(Mesh(hole_fraction=0.5), {"hole_fraction": 0.3}) == Mesh(hole_fraction=0.3)
     assert changed(SingleImage(), {"window": 21, "reduce": 2}) == SingleImage(window=21, reduce=2)
+    told = Checkerboard(radiometry=Radiometry(leakage=0.1, tone="srgb"))
+    assert changed(told, {"leakage": None, "tone": None}) == Checkerboard()
     at = VerifyPatchSize(points=(Point(x=3, y=4),))
     assert changed(at, {"leakage": 0.1}) == msgspec.structs.replace(at, leakage=0.1)
 

@@ -13,10 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 import umbra
-from daemon.frames import FrameStore
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
 from daemon.separation.estimator import Components
+from daemon.storage.frames import FrameStore
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo

@@ -8,7 +8,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +27,15 @@ PRODUCTS = ["direct.tiff", "global.tiff", "preview.png", "quality.json", "qualit
 SIZE = (48, 64)
 UMBRA = [sys.executable, "-m", "protocol.cli"]
 
-Folder = Callable[[], Path]
-
 
 @pytest.fixture(autouse=True)
-def _own_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    temporary = tmp_path / "tmp"
-    temporary.mkdir()
-    monkeypatch.setenv("TMPDIR", str(temporary))
+def _own_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Where temporary files go: a short path, for a private daemon's sockets are in there."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))  # of a daemon with no data folder
     monkeypatch.delenv("UMBRA_RIG", raising=False)
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        monkeypatch.setenv("TMPDIR", folder)
+        yield
 
 
 def umbra(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -84,9 +84,9 @@ def read(path: Path) -> NDArray[Any]:
     return image[..., ::-1]
 
 
-def daemons(tmp_path: Path) -> list[str]:
-    """The command lines of private daemons that work in this test's folder."""
-    mark = str(tmp_path).encode()
+def daemons() -> list[str]:
+    """The command lines of private daemons that work in this test's temporary folder."""
+    mark = os.environ["TMPDIR"].encode()
     found = []
     for entry in Path("/proc").glob("[0-9]*/cmdline"):
         try:
@@ -101,8 +101,8 @@ def daemons(tmp_path: Path) -> list[str]:
 def assert_no_orphan(tmp_path: Path) -> None:
     """Neither a process nor a file of a private daemon is left, here or in the user's state."""
     assert not (tmp_path / "state").exists()
-    assert not daemons(tmp_path)
-    assert not list((tmp_path / "tmp").glob("umbra-*"))
+    assert not daemons()
+    assert not list(Path(os.environ["TMPDIR"]).glob("umbra-*"))
 
 
 def test_demo(tmp_path: Path) -> None:
@@ -112,12 +112,21 @@ def test_demo(tmp_path: Path) -> None:
     assert set(PRODUCTS) <= {p.name for p in out.iterdir()}
     assert "direct  RMSE 0.0" in done.stdout
     assert "global  RMSE 0.0" in done.stdout
+    assert "carry no flag; the RMSE is over these" in done.stdout
     assert "25/27" in done.stderr or "27/27" in done.stderr
     direct, truth = read(out / "direct.tiff"), read(out / "truth_direct.tiff")
     assert direct.dtype == np.float32
     good = np.isfinite(direct)
     assert np.sqrt(np.mean((direct - truth)[good] ** 2)) < 0.06 * 4095
     assert_no_orphan(tmp_path)
+
+
+def test_demo_of_a_mesh_has_a_lamp_and_a_stage(tmp_path: Path) -> None:
+    done = umbra("demo", "-m", "mesh", "--speed", "4", "--coverage", "0.5", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "scan    mesh" in done.stdout
+    assert "direct  RMSE 0.0" in done.stdout
+    assert (tmp_path / "umbra-demo" / "report.html").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
@@ -134,7 +143,7 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
             break
     else:
         pytest.fail("the demo ended before it ran")
-    assert daemons(tmp_path)
+    assert daemons()
     process.send_signal(number)
     said = process.stderr.read()
     process.stderr.close()
@@ -149,9 +158,9 @@ def test_demo_cut_short_leaves_no_daemon(number: signal.Signals, tmp_path: Path)
         assert_no_orphan(tmp_path)
     else:  # its folder cannot be cleared away by the dead; the daemon goes all the same
         assert code == -signal.SIGKILL
-        (folder,) = (tmp_path / "tmp").glob("umbra-*")
+        (folder,) = Path(os.environ["TMPDIR"]).glob("umbra-*")
         until(lambda: not _listens(folder / "command"))
-        until(lambda: not daemons(tmp_path))
+        until(lambda: not daemons())
         shutil.rmtree(folder)
     assert not (tmp_path / "out").exists()
 

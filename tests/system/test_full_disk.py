@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from protocol.errors import Code, UmbraError
 from protocol.messages.rig import RigState
 from protocol.messages.runs import RunState
-from tests.system.harness import SLOW, Daemon, recorded, until
+from tests.system.harness import Daemon, recorded, until
 
 pytestmark = pytest.mark.system
 
@@ -29,7 +29,7 @@ def tiny(daemon: Daemon) -> Iterator[Path]:
     mounting = ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(daemon.data)]
     if os.geteuid() != 0 or subprocess.run(mounting, capture_output=True, check=False).returncode:
         pytest.skip("mounting a tmpfs needs root")
-    daemon.configure(scale=SLOW)
+    daemon.configure(scale=0.5)
     text = daemon.config.read_text().replace("reserve_mb = 1", "reserve_mb = 0")
     daemon.config.write_text(text + "[sequencer]\nring_frames = 4\n")
     yield daemon.data

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench
 from daemon.separation.estimator import Components
+from daemon.storage.frames import FrameStore
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
@@ -95,7 +95,7 @@ def test_the_queue_survives_in_its_order(daemon: Daemon) -> None:
 
 
 def test_a_submission_repeated_after_a_restart_is_the_same_run(daemon: Daemon) -> None:
-    from daemon.store import Store  # the request id is the daemon's own
+    from daemon.storage.store import Store  # the request id is the daemon's own
 
     with daemon.start() as rig:
         run = rig.scan(umbra.TwoImage())

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
 from daemon.separation.estimator import Components
+from daemon.storage.frames import FrameStore
 from protocol.messages.rig import StageState
 from protocol.messages.runs import RunState
 from tests.system.harness import Daemon, recorded, until

@@ -13,10 +13,10 @@ import msgspec
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from protocol.errors import UmbraError
 from protocol.messages.replies import Status
-from protocol.messages.rig import RigState
+from protocol.messages.rig import RigState, StageState
 from protocol.messages.runs import RunState
 from protocol.run import Run
 from protocol.scans.spec import Ready
@@ -135,14 +135,38 @@ def test_a_wait_can_be_aborted_and_survives_a_kill(daemon: Daemon) -> None:
         run = rig.scan(umbra.Mesh(**MESH, ready=ready)).id
         until(lambda: rig.run(run).refresh().state is RunState.WAITING)
         daemon.kill()
+    with daemon.start() as rig:  # it had lost nothing, and goes on waiting
+        until(lambda: rig.run(run).refresh().state is RunState.WAITING)
+        assert not rig.status().queue
+        assert daemon.stop() == 0
     with daemon.start() as rig:
-        assert rig.run(run).refresh().state is RunState.INTERRUPTED
-        rig.resume(run)
         until(lambda: rig.run(run).refresh().state is RunState.WAITING)
         rig.abort(run)
         # The next look is 150 s away: longer than this has patience.
         assert rig.run(run).wait(60, check=False).state is RunState.ABORTED
         until(lambda: rig.status().state is RigState.IDLE)
+
+
+def test_a_stage_in_alarm_is_waited_for_until_somebody_has_looked(daemon: Daemon) -> None:
+    garden(daemon, NIGHT)
+    text = daemon.config.read_text()
+    daemon.config.write_text(text.replace('light = "sun"\n', 'faults = ["no-switch@1"]\n'))
+    ready = Ready(deadline_s=86_400.0, light_min=0.3, look_s=600.0)
+    with daemon.start() as rig:
+        run = rig.scan(umbra.Mesh(**MESH, ready=ready)).id
+
+        def waits(what: str, seen: str) -> bool:
+            progress = rig.status().progress
+            found = progress and progress.waits
+            return bool(found and found.what == what and seen in found.seen)
+
+        until(lambda: waits("stage", "limit switch X was not found"))
+        with pytest.raises(UmbraError, match="is using the devices"):
+            rig.stage_home(30.0)
+        rig.stage_unlock()  # the next look is 150 s away, and comes at once
+        until(lambda: waits("light", "0.0%"))
+        assert rig.stage().state is StageState.IDLE
+        rig.abort(run)
 
 
 def test_a_device_that_is_away_is_waited_for(daemon: Daemon) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import umbra
-from daemon.frames import FrameStore
+from daemon.storage.frames import FrameStore
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import RunState
 from tests.system.harness import ENDLESS, FAST, Daemon, recorded, until

@@ -110,7 +110,12 @@ def aravis(tmp_path: Path) -> Iterator[str]:
     np.save(tmp_path / "film.npy", film())
     film_file = str(tmp_path / "film.npy")
     program = [sys.executable, aravis_peer.__file__, "127.0.0.1", "GV12", film_file]
-    with subprocess.Popen(program) as camera:
+    with (
+        aravis_peer.loopback(),
+        subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as camera,
+    ):
+        assert camera.stdout is not None
+        assert camera.stdout.readline() == "ready\n"
         yield f"""
 driver = "aravis"
 address = "127.0.0.1"

@@ -1,4 +1,5 @@
-"""Processes that start warm: forks of one that has imported umbrad and built the virtual scene.
+"""Processes that start warm: forks of one that has imported umbrad, built the virtual scene and
+simulated the ranks of the paper's patterns.
 
 A fresh interpreter needs a second of computing before umbrad's first line, a fork needs none; from
 there on it is a process like any other: its signals, sockets, files and end are its own. What a
@@ -42,7 +43,9 @@ class Process:
             socket.send_fds(_nursery(), [request], [stderr, writing])
         finally:
             os.close(writing)
-        self.pid = int(self._news.readline())
+        born = self._news.readline()
+        assert born, "the nursery has ended: its error output says why"
+        self.pid = int(born)
         self.returncode: int | None = None
 
     def poll(self) -> int | None:
@@ -113,11 +116,19 @@ def _prepare() -> None:
     import cv2
 
     import daemon.app  # noqa: F401
+    from daemon.scans.catalog import method_for
+    from daemon.scans.method import Bench
+    from drivers.base.camera import CameraInfo
+    from drivers.base.pixelformat import PixelFormat
+    from drivers.base.projector import ProjectorInfo
     from drivers.virtual import camera, light, projector, stage  # noqa: F401
     from drivers.virtual.scene import patches
+    from protocol.scans.projected import Checkerboard
 
     cv2.setNumThreads(0)  # a pool of threads would not live through a fork
     patches()
+    bench = Bench(CameraInfo(64, 48, PixelFormat.MONO12), ProjectorInfo(64, 48, 60.0))
+    method_for(Checkerboard(), bench).estimator()
     cv2.setNumThreads(-1)
     assert len(list(Path("/proc/self/task").iterdir())) == 1
     signal.signal(signal.SIGCHLD, _reap)

@@ -1,0 +1,1 @@
+"""The rig's devices: their threads, their health, and looks at the scene through them."""

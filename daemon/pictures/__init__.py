@@ -1,0 +1,1 @@
+"""Pictures for eyes; nothing is measured in them."""

@@ -1,0 +1,1 @@
+"""What a run leaves: images, masks, figures, plots, and a report."""
