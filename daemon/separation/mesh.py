@@ -90,17 +90,21 @@ class MeshOccluder:
         elif observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
         else:
+            high, low = self._plateaus.high, self._plateaus.low
+            known = (high.extreme, low.extreme) if self._plateaus.frames else None
             if observation.fresh and self._last is not None:
                 self._unused += self._plateaus.frames
                 self._begin()
             pixels = self._response.scaled(pixels, 1.0 / observation.strength)
-            self._take(pixels, observation.warp is not None, left_out)
+            told = without(pixels, left_out, known)
+            self._take(pixels, told, observation.warp is not None)
             if left_out is not None:
                 if self._left_out is None:
                     self._left_out = np.zeros(left_out.shape, np.uint16)
                 self._left_out += left_out
 
-    def _take(self, pixels: NDArray[Any], moved: bool, left_out: NDArray[np.bool_] | None) -> None:
+    def _take(self, pixels: NDArray[Any], told: NDArray[Any], moved: bool) -> None:
+        """A frame, and what it tells of each pixel."""
         part = self._sampled(_SAMPLE)
         sample = pixels[part]
         light = self._response.linear(sample).astype(np.float64)
@@ -114,9 +118,7 @@ class MeshOccluder:
         frames = self._plateaus.frames + 1
         if frames & (frames - 1) == 0 and (noise := self.noise()) is not None:
             self._table = self._deviations(noise)
-        high, low = self._plateaus.high, self._plateaus.low
-        known = (high.extreme, low.extreme) if self._plateaus.frames else None
-        self._plateaus.add(without(pixels, left_out, known), self._table)
+        self._plateaus.add(told, self._table)
 
     def _sampled(self, step: int) -> Part:
         """Every so many rows and columns; of a mosaic, of one colour."""

@@ -51,6 +51,7 @@ _TAPER = 0.08  # part of the picture at each edge that fades out
 _SHORTEST = (1, 16, 8, 4, 2, 1, 1, 1, 1)
 """Wavelengths, in small pixels, that count in each round of aligning the first frames: all, to see
 whether they lie apart at all; then long ones first, which a shake leaves in the mean."""
+_TOLD = 8.0  # deviations of a shift by which it is told from none: shadows make some large
 _SETTLED = 0.15  # px: first frames that wander less from round to round lie apart as they do
 _TILE = 16  # small pixels: halves of the picture are a checkerboard of such squares
 _SAMPLED = 6  # every so many of the first frames show how far the halves agree
@@ -63,20 +64,22 @@ _SHARE = 0.35  # of the height that the reference's own peak has
 @dataclass(frozen=True, slots=True)
 class Place:
     """Where a frame was taken from: by how much its middle is shifted against the reference's, in
-    pixels, and turned, in radians; `px`: how far the corner that moved most has. `found`: it is
+    pixels, and turned, in radians; `px`: how far the corner that moved most has; what is not more
+    than `least` is not told from none. `found`: it is
     known, as well as `UNSURE_PX` asks."""
 
     x: float
     y: float
     turn: float = 0.0
     px: float = 0.0
+    least: float = 0.0
     found: bool = True
     middle: tuple[float, float] = (0.0, 0.0)
 
     @property
     def warp(self) -> Warp | None:
         """What takes the frame back to the reference; None: it lies there."""
-        if self.px <= LEAST_PX:
+        if self.px <= self.least:
             return None
         if not self.turn:
             return (1.0, 0.0, -self.x, 0.0, 1.0, -self.y)
@@ -175,9 +178,10 @@ class Registration:
         height, width = self._full
         middle = ((width - 1) / 2.0, (height - 1) / 2.0)
         swung = abs(turn) * math.hypot(*middle)
-        if swung <= LEAST_PX:
+        least = max(LEAST_PX, _TOLD * self.sd) if math.isfinite(self.sd) else LEAST_PX
+        if swung <= least:
             turn = swung = 0.0
-        return Place(x, y, turn, math.hypot(x, y) + swung, found, middle)
+        return Place(x, y, turn, math.hypot(x, y) + swung, least, found, middle)
 
     # ------------------------------------------------------------ pictures
 

@@ -8,7 +8,8 @@ samples find each such mixture. So there are two collections of the same frames:
 - *all*: all of them count.
 
 Each pixel's components are the sure ones. Where those are not known, for the camera never stood
-still while the shadow passed an edge, they are those of all, and marked as moved. Until a frame is
+still while the shadow passed an edge, they are those of all, and marked as moved. Where it shook in
+most of the frames all components are those of all. Until a frame is
 moved there is one collection, and its result is that of the estimator alone, bit for bit.
 """
 
@@ -16,13 +17,21 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.estimator import Components, Estimator, NotYet, Observation, Quality
+from daemon.separation.estimator import (
+    Components,
+    Estimator,
+    Lighting,
+    NotYet,
+    Observation,
+    Quality,
+)
 from daemon.separation.finish import bits, count
 from daemon.separation.noise import Noise
 from daemon.separation.radiometry import Response
@@ -31,6 +40,12 @@ from daemon.separation.warping import aligned, beyond, uncertain
 UNKNOWN = np.uint16(Quality.NEVER_LIT | Quality.NEVER_UNLIT)
 """Pixels whose components are not known."""
 
+_LEFT_OUT = 0.5  # of the frames: what is left may never have been in full light, or in the umbra
+_MOSTLY = 0.5  # of the frames: if as many are moved, few pixels have sure samples enough
+_SHOOK = (
+    "The camera shook in most of the frames: edges are interpolated, and less sharp; a "
+    "firmer tripod shows them as they are"
+)
 _MARKED = 0.01  # of the pixels: as many that are moved are worth a line of advice
 
 
@@ -69,15 +84,20 @@ class Steadied:
         self._bayer = bool(response.bayer)
         self._sure = make()
         self._all: Extremes | None = None
+        self._frames = 0  # of this collection
+        self._moved = 0  # of them
+        self._left_out = np.zeros((0, 0), np.uint16)  # of them, those that tell nothing of a pixel
         self._spoiled: NDArray[np.bool_] | None = None  # by a collection's first frame, if moved
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Estimator`."""
         if observation.fresh:
             self._all = self._spoiled = None
+            self._frames = self._moved = 0
         if observation.used and observation.warp is not None:
             self._take_moved(pixels, observation, observation.warp)
             return
+        self._frames += observation.used and observation.lighting is Lighting.PATTERN
         for one in (self._sure, self._all):
             if one is not None:
                 one.update(pixels, observation)
@@ -92,12 +112,16 @@ class Steadied:
         if self._few:
             self._sure.update(moved, observation, outside)
             return
-        scene = None if observation.fresh else self._sure.brightest()
+        scene = self._sure.brightest()
         doubtful = outside | uncertain(pixels, warp, self._bayer, self._sure.noise(), scene)
         if self._all is None:
             self._all = copy.deepcopy(self._sure)
             if scene is None:
                 self._spoiled = doubtful
+            self._left_out = np.zeros(doubtful.shape, np.uint16)
+        self._left_out += doubtful
+        self._frames += 1
+        self._moved += 1
         self._sure.update(moved, observation, doubtful)
         self._all.update(moved, observation, outside)
 
@@ -106,6 +130,8 @@ class Steadied:
         if self._all is None:
             return _components(self._sure)
         every = _components(self._all)
+        if self._moved > _MOSTLY * self._frames:
+            return replace(every, facts={**every.facts, "advice": [*every.facts["advice"], _SHOOK]})
         try:
             sure = _components(self._sure)
         except NotYet:
@@ -115,6 +141,7 @@ class Steadied:
     def _joined(self, sure: Components, every: Components) -> Components:
         """The sure components, and those of all frames where they are needed."""
         lacking = sure.quality & UNKNOWN != 0
+        lacking |= self._left_out > _LEFT_OUT * self._frames
         if self._spoiled is not None:
             lacking |= self._spoiled
         lacking &= every.quality & UNKNOWN == 0
