@@ -38,9 +38,9 @@ _PILED = 1e-3  # of all samples, at the largest count of any: light is not so of
 
 
 UNCHECKED = (
-    "no black, white or ambient frame came with the patterns: light of the room counts as global, "
-    "and black level, leakage and tone curve are taken as given, for little is there to check them "
-    "by (of photographs: --black-frame, --white-frame; of a scan: --references)"
+    "no black, white or ambient frame came with the patterns: light of the room, if any, counts as "
+    "global, and black level, leakage and tone curve are taken as told (of photographs: "
+    "--black-frame, --white-frame, --ambient-frame; of a scan: --references)"
 )
 """Advice where patterns are all that there is."""
 

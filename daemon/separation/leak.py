@@ -25,6 +25,7 @@ _RESOLVED = 0.5
 _DIRECT = 0.25
 """Of the light, at least this part must be direct where contrast is measured."""
 _SURE = 0.05
+_USUAL = 4  # px: scans show no smaller patches, and that these blur is no news
 
 
 class Leak:
@@ -80,10 +81,11 @@ class Leak:
         of_image, of_optics = blur.of_image(contrast), blur.of_optics(contrast)
         advice = []
         lost = [str(row["size"]) for row in rows if not row["measurable"]]
-        if lost:
+        blurred = [row["size"] for row in rows if not row["measurable"] and row["size"] >= _USUAL]
+        if blurred:
             advice.append(
-                f"Leakage cannot be measured for patches of {', '.join(lost)} px: the optics of "
-                "projector and camera blur a patch with its neighbours."
+                f"Patches of up to {max(blurred)} px are blurred with their neighbours by "
+                "projector and camera: focus both, or scan with larger ones."
             )
         if plateau is None:
             advice.append("Even the largest patches leak: focus the projector.")

@@ -443,12 +443,13 @@ def _advice(beta: float | None, pull: dict[str, float]) -> list[str]:
     lines = []
     if beta is not None:
         lines.append(
-            f"Global holds {1.0 / beta:.2g} times the light that is not the source's: an ambient "
-            "frame (--references ambient, of a lamp) or an open one (of recordings) takes it out"
+            f"light that is not the source's (sky, room), if any, counts {1.0 / beta:.2g} times in "
+            "global: a frame with the source off takes it out (of a scan: --references ambient; of "
+            "a recording: --ambient-frame, or --open-frame for one without the mesh)"
         )
     if pull.get("direct", 0.0) > _PULLED:
         lines.append(
-            "Noise, and penumbra that it hides, may make direct up to "
+            "noise, and penumbra that it hides, may make direct up to "
             f"{pull['direct']:.0%} too small and global up to {pull['global']:.0%} too large "
             "(medians), where a place is in full light or in the umbra only for a moment: expose "
             "longer, move more slowly (--feed-mm-s), or take a coarser mesh or one that is nearer"

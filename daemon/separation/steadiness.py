@@ -107,7 +107,8 @@ def leaks(references: References, leakage: float) -> list[str]:
     if leakage > middle + _OVER:
         return [
             f"the leakage {leakage:g} cannot be: black frames have {middle:.3f} of the light of "
-            "white ones, ambient light included: run `umbra calibrate leak`, or give --leakage"
+            "white ones, ambient light included: measure it with `umbra calibrate leak`, or give "
+            f"--leakage {max(middle, 0.0):.3f} at most"
         ]
     dim, typical, bright = (float(q) for q in np.quantile(white, [0.25, 0.5, 0.75]))
     scatter = (high - low) / max(middle - leakage, 1e-6)
@@ -116,7 +117,7 @@ def leaks(references: References, leakage: float) -> list[str]:
     if middle > leakage + 0.01 and scatter < min(_PLAIN, 0.5 * contrast):
         return [
             f"black frames have {middle:.3f} of the light of white ones all over the picture, as "
-            f"leakage does and a room's light seldom; it is said to be {leakage:g}: run "
-            "`umbra calibrate leak`, or give --leakage"
+            f"leakage does and a room's light seldom, but the leakage was told to be {leakage:g}: "
+            f"give --leakage {middle:.3f}, or measure it with `umbra calibrate leak`"
         ]
     return []

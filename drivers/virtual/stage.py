@@ -252,7 +252,9 @@ class VirtualStage(VirtualDevice, Stage):
         o = self._o
         if self._state is not StageState.IDLE:
             remedy = "resume it" if self._state is StageState.HELD else "home it"
-            raise DeviceRefused(self.name, phase, f"it is {self._state}", remedy)
+            unknown = self._state is StageState.UNKNOWN
+            problem = "its position is not known" if unknown else f"it is {self._state}"
+            raise DeviceRefused(self.name, phase, problem, remedy)
         for axis, (low, high), (least, most) in (
             ("x", x, o.travel_x_mm),
             ("y", y, o.travel_y_mm),

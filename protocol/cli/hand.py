@@ -31,7 +31,10 @@ class Switch(enum.StrEnum):
 
 def snap(
     *,
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE.png", help="The PNG file.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="FILE.png", help="The PNG file; without: the facts."),
+    ] = None,
     raw: Annotated[
         bool, typer.Option("--raw", help="Keep a colour camera's mosaic as it is.")
     ] = False,
@@ -40,25 +43,29 @@ def snap(
     keys: Keys = None,
     as_json: Json = False,
 ) -> None:
-    """Take one frame as things are and save it as PNG, 8 or 16 bit as the camera gives it.
+    """Take one frame as things are: how bright it is and what saturates, and with -o the frame
+    itself as PNG, 8 or 16 bit as the camera gives it.
 
     --json: a Picture (its facts, no pixels).
     """
-    png_name(out)
-    if out.exists() and not force:
-        raise UmbraError(
-            Code.BAD_REQUEST, f"{out} is there already; give --force, or another name", "--out"
-        )
-    if not out.absolute().parent.is_dir():
-        raise UmbraError(Code.BAD_REQUEST, f"{out.parent} is not a folder", "--out")
+    if out is not None:
+        png_name(out)
+        if out.exists() and not force:
+            raise UmbraError(
+                Code.BAD_REQUEST, f"{out} is there already; give --force, or another name", "--out"
+            )
+        if not out.absolute().parent.is_dir():
+            raise UmbraError(Code.BAD_REQUEST, f"{out.parent} is not a folder", "--out")
     with connect(rig, keys) as client:
         picture = client.snap(png=True, demosaic=not raw)
-    write_file(out, picture.pixels.tobytes())
+    if out is not None:
+        write_file(out, picture.pixels.tobytes())
     if as_json:
         print_json(Picture(facts=picture.facts))
-    else:
+        return
+    if out is not None:
         print(out)
-        say_facts(picture.facts)
+    say_facts(picture.facts)
 
 
 # ---------------------------------------------------------------- camera, lights

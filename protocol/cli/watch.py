@@ -21,7 +21,8 @@ ENDS = {RunState.DONE: Exit.OK, RunState.ABORTED: Exit.ABORTED}
 
 
 def watch(run: RunId = "", rig: Rig = None, keys: Keys = None, as_json: Json = False) -> int:
-    """Follow a run until it ends. Ctrl-C only ends the watching: the run goes on.
+    """Follow a run until it ends, and say what it found. Ctrl-C only ends the watching: the run
+    goes on.
 
     --json: a Progress a line, and at the end the RunInfo. Exits as the run ended: 0, 1 or 5.
     """
@@ -29,9 +30,12 @@ def watch(run: RunId = "", rig: Rig = None, keys: Keys = None, as_json: Json = F
         followed = client.run(run)
         with goes_on(followed.id):
             follow(followed, as_json=as_json)
-    if as_json:
-        print_json(followed.info, lines=True)
-    return conclude(followed.info, quiet=as_json)
+        if as_json:
+            print_json(followed.info, lines=True)
+        code = conclude(followed.info, quiet=as_json)
+        if not as_json and not code:
+            tell(followed.facts())
+    return code
 
 
 @contextmanager
@@ -136,5 +140,6 @@ def _lines(news: Iterable[Progress]) -> None:
     for now in news:
         step = (now.state, int((now.fraction or 0.0) * 10))
         if step != told:
-            say(f"{now.state.value}: {count(now)}" + (f" · {now.phase}" if now.phase else ""))
+            phase = "" if now.phase in ("", now.state.value) else f" · {now.phase}"
+            say(f"{now.state.value}: {count(now)}{phase}")
             told = step

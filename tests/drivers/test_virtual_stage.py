@@ -100,7 +100,7 @@ def test_position_is_unknown_until_it_is_homed_and_after_a_reconnect() -> None:
     stage = cast(VirtualStage, make(here, "stage", "stage"))
     assert stage.status().state is StageState.UNKNOWN
     assert stage.position_at(here.clock.now_ns()) is None
-    with pytest.raises(DeviceRefused, match="stage: move: it is unknown; home it"):
+    with pytest.raises(DeviceRefused, match="stage: move: its position is not known; home it"):
         stage.move(1, 1, 10)
     stage.home(60)
     status = stage.status()

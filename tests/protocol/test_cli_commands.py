@@ -378,6 +378,26 @@ def test_watch_as_json_is_a_line_an_event(rig: Rig, capsys: Captured) -> None:
     assert msgspec.json.decode(last, type=RunInfo).id == "run-1"
 
 
+def test_watch_says_what_the_run_found(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+) -> None:
+    rig.make("direct")
+    monkeypatch.setattr("protocol.run.Run.facts", lambda _: {"advice": ["cover the mirror"]})
+    assert run(["watch"]) == Exit.OK
+    assert "advice: cover the mirror" in capsys.readouterr().err
+
+
+def test_snap_without_a_file_tells_of_the_frame(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["snap"]) == Exit.OK
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "saturated" in err
+    assert not list(tmp_path.iterdir())
+
+
 def test_steering_without_a_run_names_the_one_it_means(rig: Rig) -> None:
     rig.make("direct")
     assert run(["abort"]) == Exit.OK
