@@ -12,6 +12,7 @@ from daemon.scans.method import Bench, Digest, Expose, Taken
 from daemon.separation.estimator import Components, Quality
 from daemon.separation.finish import Judgement, finish
 from daemon.separation.radiometry import Response
+from daemon.separation.registration import REFERENCE, Registration
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from protocol.scans.anyscan import AnyScan
@@ -32,6 +33,7 @@ BLACK_AND_WHITE = (Reference.BLACK, Reference.WHITE)
         (RandomBinary(patterns=3, references=()), (8, 8), PixelFormat.MONO8),
         (RandomPhase(average=2, references=()), (3, 3), PixelFormat.RGB8),
         (Sinusoid(average=2, references=()), (1, 1), PixelFormat.MONO8),
+        (Sinusoid(periods=(8.0, 16.0), references=()), (8, 8), PixelFormat.MONO8),
         (TwoImage(references=BLACK_AND_WHITE), (8, 8), PixelFormat.MONO8),
     ],
 )
@@ -78,3 +80,14 @@ def test_a_colour_that_no_neighbour_has_is_flagged_as_they_are() -> None:
     assert good[:, 0].all()
     assert np.isfinite(found.direct[good]).all()
     assert np.isfinite(found.global_[good]).all()
+
+
+@pytest.mark.parametrize("level", [0, 90])
+def test_first_frames_that_are_all_the_same_lie_in_one_place(level: int) -> None:
+    camera = Registration(Response(full_scale=255))
+    pixels = np.full((20, 220), level, np.uint8)
+    for _ in range(REFERENCE):
+        camera.learn(pixels)
+    assert camera.learned
+    assert not camera.tells
+    assert camera.wandered == 0.0
