@@ -62,8 +62,9 @@ def unevenness(
     pixels = much if much.ndim == 2 else np.logical_or.reduce(much, axis=2)
     flags = bits(pixels, Quality.DISAGREE)
     part = float(np.mean(pixels))
+    square = np.square(error)
     return Uneven(
-        {name: np.hypot(plane, error) for name, plane in planes.items()},
+        {name: np.sqrt(np.square(plane) + square) for name, plane in planes.items()},
         flags,
         [_SAID.format(part)] if part > _MANY else [],
     )
@@ -77,8 +78,7 @@ def _error(low: Plane, high: Plane, noise: Plane, patterns: int) -> Plane:
     bright, share = thinned(step), thinned(np.maximum(spread - of_noise, 0) / np.square(around))
     lit = bright >= np.float32(_BRIGHT) * np.quantile(bright, 0.99)
     usual = np.float32(_USUAL**2 * np.quantile(share[lit], _CALM))
-    spread -= np.float32(_SURE**2) * of_noise
-    spread -= usual * np.square(around)
+    spread -= np.float32(_SURE**2) * of_noise + usual * np.square(around)
     # as a part of the step: the colours of a mosaic differ in light
     part = np.sqrt(np.maximum(spread, 0, out=spread)) / around
     return np.asarray(np.float32(_ERROR) * part * step, dtype=np.float32)
