@@ -55,8 +55,11 @@ class Latency:
 
     def _flash(self, pixels: NDArray[Any], observation: Observation) -> None:
         if self._planes is None:
-            if self._saturated is None:
-                raise ValueError("flashes are measured against black and white, which come first")
+            if self._saturated is None or not self._black.frames:
+                raise NotYet(
+                    "flashes are measured against black and white, which came incomplete: "
+                    "calibrate again"
+                )
             black, white = self._black.value(), self._white.value()
             good = bright(black, white, self._saturated)
             self._planes = black, float((white - black)[good].sum(dtype=np.float64)), good

@@ -90,11 +90,11 @@ class MeshOccluder:
         elif observation.lighting is not Lighting.PATTERN:
             self._references.add(pixels, observation.lighting)
         else:
-            high, low = self._plateaus.high, self._plateaus.low
-            known = (high.extreme, low.extreme) if self._plateaus.frames else None
             if observation.fresh and self._last is not None:
                 self._unused += self._plateaus.frames
                 self._begin()
+            high, low = self._plateaus.high, self._plateaus.low
+            known = (high.extreme, low.extreme) if self._plateaus.frames else None
             pixels = self._response.scaled(pixels, 1.0 / observation.strength)
             told = without(pixels, left_out, known)
             self._take(pixels, told, observation.warp is not None)

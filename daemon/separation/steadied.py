@@ -112,8 +112,10 @@ class Steadied:
         if self._few:
             self._sure.update(moved, observation, outside)
             return
-        scene = self._sure.brightest()
-        doubtful = outside | uncertain(pixels, warp, self._bayer, self._sure.noise(), scene)
+        scene = noise = None
+        if not observation.fresh:  # else they would be those of the collection before
+            scene, noise = self._sure.brightest(), self._sure.noise()
+        doubtful = outside | uncertain(pixels, warp, self._bayer, noise, scene)
         if self._all is None:
             self._all = copy.deepcopy(self._sure)
             if scene is None:

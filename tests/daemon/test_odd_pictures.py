@@ -9,14 +9,14 @@ import pytest
 
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Digest, Expose, Taken
-from daemon.separation.estimator import Components, Quality
+from daemon.separation.estimator import Components, Observation, Quality
 from daemon.separation.finish import Judgement, finish
 from daemon.separation.radiometry import Response
 from daemon.separation.registration import REFERENCE, Registration
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from protocol.scans.anyscan import AnyScan
-from protocol.scans.occluded import Mesh
+from protocol.scans.occluded import Mesh, Stick
 from protocol.scans.projected import GrayCode, RandomBinary, RandomPhase, Sinusoid, TwoImage
 from protocol.scans.spec import Reference
 
@@ -91,3 +91,28 @@ def test_first_frames_that_are_all_the_same_lie_in_one_place(level: int) -> None
     assert camera.learned
     assert not camera.tells
     assert camera.wandered == 0.0
+
+
+@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("spec", [Mesh(hole_fraction=0.3, frames=9), Stick(frames=9)])
+def test_a_collection_that_begins_anew_keeps_nothing_of_the_one_before(
+    spec: AnyScan, moved: bool
+) -> None:
+    rng = np.random.default_rng(1)
+    frames = list(rng.integers(0, 4000, (9, 12, 16), dtype=np.uint16))
+    begins = Observation(fresh=True, warp=(1.0, 0.0, 0.4, 0.0, 1.0, -0.3) if moved else None)
+    follows = Observation(warp=(1.0, 0.0, 1.6, 0.0, 1.0, 0.0))
+    camera = CameraInfo(16, 12, PixelFormat.MONO12, recorded=True)
+    went_on, anew = (method_for(spec, Bench(camera)).estimator() for _ in range(2))
+    for frame in frames[:4]:
+        went_on.update(frame // 8, follows)
+        went_on.update(frame // 8, Observation())
+    for frame, observation in zip(frames[4:], (begins, follows, *[Observation()] * 3), strict=True):
+        went_on.update(frame, observation)
+        anew.update(frame, observation)
+    one, other = went_on.result(), anew.result()
+    assert isinstance(one, Components)
+    assert isinstance(other, Components)
+    np.testing.assert_array_equal(one.direct, other.direct)
+    np.testing.assert_array_equal(one.global_, other.global_)
+    np.testing.assert_array_equal(one.quality, other.quality)
