@@ -71,8 +71,9 @@ BITS: tuple[Bit, ...] = (
     ),
     Bit(
         Quality.DISAGREE,
-        "Patterns of different frequency give different components.",
-        "The finer pattern is the one to trust; global light varies quickly here.",
+        "Patterns give different components here: global light varies within a patch or period.",
+        "Direct may be too large. Of several frequencies the finer is the one to trust; of one, a "
+        "finer pattern tells.",
         (255, 159, 28),
     ),
     Bit(

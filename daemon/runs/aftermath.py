@@ -1,10 +1,12 @@
-"""What follows a run's end: old runs make room, and whoever wants to know is told.
+"""What follows a run's end: old runs and memory make room, and whoever wants to know is told.
 
 Neither may harm a run: what goes wrong here is logged, and tried again after the next run.
 """
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import subprocess
 
 import msgspec
@@ -25,6 +27,16 @@ def after(run: RunFolder, store: Store, config: RigConfig) -> None:
     """Tell of a run that has ended, then delete what is past keeping. Blocks: not for the loop."""
     tell(run, config.hooks)
     expire(store, config, run)
+
+
+def give_back() -> None:
+    """Let the system have an ended run's memory. Its parts refer to each other, and would stay
+    until a collection that many runs may precede; and glibc keeps what is freed, in pieces that fit
+    the next run ever less. Other C libraries lack the call, and need none."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def tell(run: RunFolder, hooks: HooksSection) -> None:

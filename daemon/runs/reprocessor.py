@@ -71,6 +71,8 @@ class Reprocessor:
                 await self._wake.wait()
                 continue
             await self._run(begun)
+            del begun  # and with it its planes
+            await asyncio.to_thread(aftermath.give_back)
 
     def _begin(self) -> Reprocessing | None:
         waiting = [] if self._stopping else self._store.to_reprocess()

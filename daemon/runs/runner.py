@@ -131,6 +131,8 @@ class Runner:
                 await self._wake.wait()
                 continue
             await self._run(course)
+            del course  # and with it its frames and planes
+            await asyncio.to_thread(aftermath.give_back)
 
     def wake(self) -> None:
         """Look again whether a run can begin, or go on that waits; from any thread."""

@@ -21,7 +21,7 @@ from daemon.separation.exposure_noise import ROUNDING, Sensor
 from daemon.separation.extremes import Extremes
 from daemon.separation.frameset import FrameSet, Watched
 from daemon.separation.noise import Noise
-from daemon.separation.order_estimate import KEEP, RANKS
+from daemon.separation.order_estimate import KEEP, LEAST, RANKS
 from daemon.separation.radiometry import Response
 from protocol.patterns import BLACK, WHITE, AnyPattern
 from protocol.scans.projected import PatternScan
@@ -333,6 +333,13 @@ class RankedMethod(PatternMethod[P]):
             )
         ranked = not (few or name.startswith("maxmin"))
         known = len(self._patterns) >= 2 * RANKS
+        ordered = len(self._patterns) >= LEAST
+        if name == "maxmin-unbiased" and not ordered:
+            raise Unsuitable(
+                f"the bias of noise takes {LEAST} patterns to know; take maxmin for "
+                f"{len(self._patterns)}",
+                "$.estimator",
+            )
         return Extremes(
             response,
             lit_fraction=self.lit_fraction,
@@ -340,7 +347,7 @@ class RankedMethod(PatternMethod[P]):
             keep=KEEP if ranked else 1,
             unbiased=ranked or name == "maxmin-unbiased" or (name == "auto" and known),
             average=average,
-            levels=self.levels,
+            levels=self.levels if ordered else None,
             shifts=self.grid,
             weights=self.weights(),
         )

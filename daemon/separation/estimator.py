@@ -53,7 +53,7 @@ class Quality(enum.IntFlag):
     NEVER_UNLIT = 1 << 4  # no frame in shadow: direct and global cannot be told apart (NaN)
     NEGATIVE = 1 << 5  # a component below zero by more than noise
     RESIDUE = 1 << 6  # the pattern shows in a component: light was not smooth, as of a mirror
-    DISAGREE = 1 << 7  # frequencies give different components
+    DISAGREE = 1 << 7  # patterns give different components
     MOVED = 1 << 8  # the scene, the camera or the source changed between frames
     SINGLE = 1 << 9  # one extreme rests on a single frame: noise, or a fleck, passes for light
     EDGE = 1 << 10  # at an edge of the pattern: its light is split as its neighbours' is

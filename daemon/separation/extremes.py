@@ -26,6 +26,7 @@ from daemon.separation.references import References
 from daemon.separation.residue import NOT_SHIFTS, Mirrors, of_shifts
 from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import HALF, compare
+from daemon.separation.uneven import unevenness
 
 
 class Extremes:
@@ -170,6 +171,11 @@ class Extremes:
                 )
                 own = deviation * np.float32(1.0 / found.uneven)
                 judgement = Judgement(direct_limit, total_limit, own)
+            if len(low) > 1:
+                own = found.deviation * np.float32(1.0 / found.uneven)
+                uneven = unevenness(low, high, own, planes, patterns)
+                planes, advice = uneven.planes, advice + uneven.advice
+                flags = uneven.flags if flags is None else flags | uneven.flags
         saturated = self._saturated
         if saturated is None:
             saturated = self._high.planes[0] >= self._response.saturated_from

@@ -112,6 +112,11 @@ def finish(
         direct, indirect = (mosaic.demosaic(x, response.bayer) for x in (direct, indirect))
         for name in DEVIATIONS & planes.keys():
             planes[name] = mosaic.demosaic_deviation(planes[name], response.bayer)
+        # Where none of them has a colour, the pixel is what they are.
+        missed = ~unknown & np.isnan(direct + indirect).any(axis=2)
+        around = spread(spread(quality, Quality.NEVER_LIT), Quality.NEVER_UNLIT)
+        quality = np.where(missed, around, quality)
+        unknown |= missed
         direct[unknown] = np.nan
         indirect[unknown] = np.nan
     counted = count(quality)

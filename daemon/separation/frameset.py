@@ -306,7 +306,7 @@ class PairSums:
             return {}, []
         mean = self._sum / self._pairs
         spread = np.sqrt(np.maximum(self._squares / self._pairs - np.square(mean), 0.0))
-        bright = mean > np.median(mean)
+        bright = mean >= np.median(mean)  # all of them where there is one level
         # a frame that is wrong may leave half of the pixels as they are
         part = float(np.quantile(spread[bright] / np.maximum(mean[bright], 1e-6), 0.75))
         noise = float(np.sqrt(2.0)) * deviation / max(float(np.median(mean[bright])), 1e-6)

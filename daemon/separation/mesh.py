@@ -262,6 +262,8 @@ class MeshOccluder:
         count = lit = 0
         for row, column in np.ndindex(2, 2):
             part = np.s_[row::2, column::2]
+            if not one[part].size:  # of a picture of a single row or column
+                continue
             found = self._covered(levels.of(part), one[part], max(pitch / 2, 3.0))
             never_lit[part], never_unlit[part] = found.never_lit, found.never_unlit
             single[part], frames[part] = found.single, found.frames

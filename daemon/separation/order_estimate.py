@@ -27,6 +27,9 @@ KEEP = 5
 RANKS = 3
 """Samples to keep at each end at least: fewer do not tell blur."""
 
+LEAST = 4
+"""Patterns of which something is known of order: with fewer, there is one sample at an end."""
+
 _SOME = 8192  # pixels that a typical one is found among
 _GROUPS = 8
 _LEAST = 32  # pixels that make a group

@@ -110,12 +110,14 @@ class OrderModels:
         self._low = float(np.log(min(s[0] for s in seen)))
         self._high = float(np.log(max(s[-1] for s in seen)))
         fine = np.exp(np.linspace(self._low, self._high, _FINE))
-        self._gaps = np.stack(
-            [
-                np.stack([np.interp(fine, s, c) for c in m.gaps.reshape(ratios.size, -1).T], axis=1)
-                for s, m in zip(seen, self._models, strict=True)
-            ]
-        ).reshape(len(self._models), _FINE, 2, -1)
+        gaps = [
+            [np.interp(fine, s, c) for c in m.gaps.reshape(ratios.size, 2 * (keep - 1)).T]
+            for s, m in zip(seen, self._models, strict=True)
+        ]  # none with keep 1
+        columns = np.array(gaps).reshape(len(self._models), 2 * (keep - 1), _FINE)
+        self._gaps = np.ascontiguousarray(np.moveaxis(columns, 1, 2)).reshape(
+            len(self._models), _FINE, 2, keep - 1
+        )
 
     def at(self, place: float) -> tuple[float, OrderErrors]:
         """A blur, and its errors, at a place of BLURS that `fit` has found."""

@@ -171,11 +171,10 @@ class ComplementPair:
             return {}
         whole = white + black
         bright = whole > 0.1 * float(np.max(whole))
+        if not bright.any():
+            return {}
         residual = (first + second - whole)[bright] / whole[bright]
-        found = round(float(np.median(residual)), 5)
-        return {
-            "complement_residual": found,
-        }
+        return {"complement_residual": round(float(np.median(residual)), 5)}
 
     def summary(self) -> dict[str, float]:
         """Frames of both images, and those not used."""

@@ -62,7 +62,9 @@ class Levels:
             np.float32(_NEAR) * span + np.float32(_ASTRAY) * np.hypot(*_slopes(x, self.middle)[:2])
             for x in self._around
         ]
-        self._noisy = np.float32(_FLOOR * max(float(np.nanquantile(self._levels[0], 0.95)), 1e-3))
+        seen = self._levels[0][np.isfinite(self._levels[0])]
+        bright = float(np.quantile(seen, 0.95)) if seen.size else 0.0
+        self._noisy = np.float32(_FLOOR * max(bright, 1e-3))
         self._inner = np.zeros((height, width), np.bool_)
         self._inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
 

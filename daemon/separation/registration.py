@@ -52,6 +52,7 @@ _SHORTEST = (1, 16, 8, 4, 2, 1, 1, 1, 1)
 """Wavelengths, in small pixels, that count in each round of aligning the first frames: all, to see
 whether they lie apart at all; then long ones first, which a shake leaves in the mean."""
 _TOLD = 8.0  # deviations of a shift by which it is told from none: shadows make some large
+_ALIKE = 1e-6  # of a spectrum: less than any noise makes, for frames that are all the same
 _SETTLED = 0.15  # px: first frames that wander less from round to round lie apart as they do
 _TILE = 16  # small pixels: halves of the picture are a checkerboard of such squares
 _SAMPLED = 6  # every so many of the first frames show how far the halves agree
@@ -229,7 +230,7 @@ class Registration:
             total = np.sum(moved, axis=0)
             mean = total / count
             shadow = np.mean([np.abs(s - mean) ** 2 for s in moved], axis=0) * count / (count - 1)
-            shadow += 0.05 * np.median(shadow)
+            shadow += np.maximum(0.05 * np.median(shadow), np.float32(_ALIKE))
             for k, spectrum in enumerate(spectra):
                 others = (total - moved[k]) / (count - 1)
                 x, y, _ = self._find(spectrum, (seen * others / shadow).astype(np.complex64))
@@ -242,7 +243,7 @@ class Registration:
         moved = [self._moved(s, *d) for s, d in zip(spectra, shifts, strict=True)]
         mean = np.mean(moved, axis=0)
         shadow = np.mean([np.abs(s - mean) ** 2 for s in moved], axis=0) * count / (count - 1)
-        shadow += 0.05 * np.median(shadow)
+        shadow += np.maximum(0.05 * np.median(shadow), np.float32(_ALIKE))
         signal = np.maximum(np.abs(mean) ** 2 - shadow / count, 0.0)  # the mean has shadow, too
         self._matched = (mean / shadow).astype(np.complex64)
         self._noise = math.sqrt(_both(np.abs(mean) ** 2 / shadow))

@@ -240,15 +240,17 @@ def by_level(response: Response, light: Plane, variance: Plane, freedom: int) ->
     a χ² distribution's median is below its mean by (1 - 2/9f)³.
     """
     counts = response.counts(light)
+    if counts.size < _ENOUGH:
+        return None
     slope = response.slope(counts)
     groups = np.array_split(np.argsort(counts, kind="stable"), min(counts.size // _ENOUGH, _LEVELS))
     levels, deviations = [], []
-    for group in groups if counts.size >= _ENOUGH else ():
+    for group in groups:
         median = float(np.median(variance[group])) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
         encoded = np.sqrt(median) / max(float(np.median(slope[group])), 1e-9)
         levels.append(float(np.mean(counts[group], dtype=np.float64)))
         deviations.append(float(max(encoded, 12.0**-0.5)))
-    return Noise(tuple(levels), tuple(deviations)) if levels else None
+    return Noise(tuple(levels), tuple(deviations))
 
 
 class _Residuals:

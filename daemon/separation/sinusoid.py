@@ -228,7 +228,7 @@ class LeastSquares:
             _, cosine, sine = fit.solve()
             power = (cosine * cosine + sine * sine)[::2, ::2]
             first = power if first is None else first
-            bright = first > np.quantile(first, 0.5)
+            bright = first >= np.quantile(first, 0.5)  # all where there is no light at all
             ratio = power[bright] / np.maximum(first[bright], np.float32(1e-12))
             logs.append(0.5 * float(np.log(np.maximum(np.median(ratio), 1e-6))))
         slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0

@@ -252,7 +252,7 @@ def _tiles(patches: F32) -> F32:
     return np.ascontiguousarray(tiles).reshape(colours * TILE, surfaces * TILE)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=4)
 def transport(width: int, height: int, source: Pinhole) -> Transport:
     """T from a source to a camera of a size; built once, shared by the benches of a process."""
     return Transport(view(width, height), source)

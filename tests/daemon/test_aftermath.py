@@ -1,9 +1,11 @@
-"""After a run: the hook hears of it, and old runs make room."""
+"""After a run: the hook hears of it, old runs make room, and memory is given back."""
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -83,3 +85,21 @@ def test_old_runs_make_room_but_not_the_one_that_has_just_ended(tmp_path: Path) 
         assert {r.id for r in store.runs()} == {old.id, waiting.id, run.id}
         aftermath.after(run, store, settings(storage="keep_days = 1"))
         assert {r.id for r in store.runs()} == {waiting.id, run.id}
+
+
+class Part:
+    """Of a run that has ended; its parts know each other."""
+
+    def __init__(self) -> None:
+        self.whole = self
+
+
+def test_what_only_refers_to_itself_is_given_back() -> None:
+    gc.disable()
+    try:
+        left = weakref.ref(Part())
+        assert left() is not None
+        aftermath.give_back()
+        assert left() is None
+    finally:
+        gc.enable()

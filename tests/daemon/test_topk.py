@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from daemon.scans.method import Unsuitable
 from daemon.separation.estimator import NotYet, Observation
 from daemon.separation.extremes import Extremes
 from daemon.separation.order_estimate import KEEP
@@ -141,3 +142,14 @@ def test_a_resumed_ranking_gives_the_same_bits() -> None:
     assert a.direct.tobytes() == b.direct.tobytes()
     assert a.global_.tobytes() == b.global_.tobytes()
     assert a.planes["direct_std"].tobytes() == b.planes["direct_std"].tobytes()
+
+
+@pytest.mark.parametrize("patterns", [2, 3, 4])
+def test_a_few_patterns_are_compared_without_deviations(patterns: int) -> None:
+    """Fewer than four have no order to know of: once a crash."""
+    scene = Scene(sigma=0.003)
+    found = scene.scan(RandomBinary(patterns=patterns, references=NONE))
+    assert found.facts["estimator"] == "maxmin"
+    assert ("direct_std" in found.planes) is (patterns >= 4)
+    with pytest.raises(Unsuitable, match="takes 4 patterns"):
+        scene.scan(RandomBinary(patterns=min(patterns, 3), estimator="maxmin-unbiased"))

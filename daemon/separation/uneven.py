@@ -1,0 +1,98 @@
+"""Where light is not the same under patterns of one lit fraction: scattered, or reflected, over
+less than a patch of theirs, or by gloss.
+
+Samples of a pixel that all are wholly lit differ by noise, and those that are wholly unlit; with
+blur some are neither, by where the pixel lies in the pattern. Where light is not smooth they differ
+by it as well, and so does the result: no step from unlit to lit is direct light alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation.estimator import Quality
+from daemon.separation.finish import bits
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import thinned
+
+_BOX = (9, 9)  # pixels that a spread is averaged over: noise moves their mean by 3 % ...
+_SURE = 1.1  # ... and by more than three times that hardly ever
+_CALM = 0.25  # of the bright pixels have no larger spread by blur and place ...
+_USUAL = 2.2  # ... and hardly any has so many times theirs
+_BRIGHT = 0.2  # of the largest steps: where the usual spread is looked for
+_ERROR = 2.0  # of components, over the spread beyond all that: 1.6 in creases, 2.5 in milk
+_DEVIATIONS = 3.0  # of noise, and ...
+_PART = 0.1  # of the light: an error of more than both is flagged
+_MANY = 0.08  # of the pixels: it is said
+_TINY = np.float32(1e-6)
+_SAID = (
+    "in {:.1%} of the pixels light is not the same under patterns of one lit fraction: it is "
+    "scattered or reflected over less than a checker or patch there, and direct may be too large "
+    "by about the stated deviation; finer patterns (--checker, --patch) tell"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Uneven:
+    """`planes`: the deviations of components, and what is uneven; `flags` (H, W), uint16: where it
+    is much; `advice`: a line where that is many pixels."""
+
+    planes: dict[str, Plane]
+    flags: NDArray[np.uint16]
+    advice: list[str]
+
+
+def unevenness(
+    low: Plane, high: Plane, noise: Plane, planes: dict[str, Plane], patterns: int
+) -> Uneven:
+    """What the ranks of samples differ by beyond noise and what is usual in the scene.
+
+    `low`, `high` (K, H, W[, 3]): the light of the darkest and brightest samples of so many
+    patterns, the most extreme first; `noise` (H, W[, 3]): the deviation of a sample; `planes`:
+    those of the components by noise alone. All float32.
+    """
+    error = _error(low, high, noise, patterns)
+    known = np.maximum.reduce(list(planes.values()))
+    much = error > np.maximum(np.float32(_DEVIATIONS) * known, np.float32(_PART) * high[0])
+    pixels = much if much.ndim == 2 else np.logical_or.reduce(much, axis=2)
+    flags = bits(pixels, Quality.DISAGREE)
+    part = float(np.mean(pixels))
+    square = np.square(error)
+    return Uneven(
+        {name: np.sqrt(np.square(plane) + square) for name, plane in planes.items()},
+        flags,
+        [_SAID.format(part)] if part > _MANY else [],
+    )
+
+
+def _error(low: Plane, high: Plane, noise: Plane, patterns: int) -> Plane:
+    step = np.maximum(high[0] - low[0], _TINY)
+    around = _mean(step)
+    spread = np.square(_mean((high[0] - high[-1]) + (low[-1] - low[0])))
+    of_noise = np.square(_mean(noise) * np.float32(2.0 * _distance(len(low), patterns // 2)))
+    bright, share = thinned(step), thinned(np.maximum(spread - of_noise, 0) / np.square(around))
+    lit = bright >= np.float32(_BRIGHT) * np.quantile(bright, 0.99)
+    usual = np.float32(_USUAL**2 * np.quantile(share[lit], _CALM))
+    spread -= np.float32(_SURE**2) * of_noise + usual * np.square(around)
+    # as a part of the step: the colours of a mosaic differ in light
+    part = np.sqrt(np.maximum(spread, 0, out=spread)) / around
+    return np.asarray(np.float32(_ERROR) * part * step, dtype=np.float32)
+
+
+def _mean(plane: Plane) -> Plane:
+    return np.asarray(cv2.blur(plane, _BOX, borderType=cv2.BORDER_REFLECT), dtype=np.float32)
+
+
+def _distance(keep: int, samples: int) -> float:
+    """The largest of so many samples of deviation 1 less the keep-th largest, on the average (by
+    Blom's places)."""
+    samples = max(samples, keep)
+    first, last = (
+        NormalDist().inv_cdf(1.0 - (rank - 0.375) / (samples + 0.25)) for rank in (1, keep)
+    )
+    return first - last

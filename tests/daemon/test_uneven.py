@@ -1,0 +1,62 @@
+"""Light that is not the same under patterns of one lit fraction."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon import patterns
+from daemon.scans.method import Expose
+from daemon.separation.estimator import Lighting, Quality
+from protocol.scans.anyscan import AnySeparation
+from protocol.scans.projected import Checkerboard, RandomBinary
+from tests.daemon.scene import FULL, Scene
+
+CLOUDY = np.s_[16:-16, 80:-8]
+CLEAR = np.s_[16:-16, 8:48]
+
+
+class Milk(Scene):
+    """A scene whose right half scatters half of what would be direct over a few pixels."""
+
+    def frame(self, step: Expose, rng: np.random.Generator) -> NDArray[np.uint16]:
+        self.change = self._scattered if step.lighting is Lighting.PATTERN else _same
+        return super().frame(step, rng)
+
+    def _scattered(self, light: NDArray[Any], step: Expose) -> NDArray[Any]:
+        assert step.pattern is not None
+        shown = patterns.render(step.pattern, self.width, self.height) / 255.0
+        near = cv2.GaussianBlur(shown, (0, 0), 2.0, borderType=cv2.BORDER_REFLECT) - shown
+        near[:, :64] = 0.0
+        return np.asarray(light + 0.5 * self.direct * near)
+
+
+def _same(light: NDArray[Any], _: Expose) -> NDArray[Any]:
+    return light
+
+
+@pytest.mark.parametrize("spec", [Checkerboard(), RandomBinary()])
+def test_what_scatters_over_less_than_a_patch_is_stated_and_told(spec: AnySeparation) -> None:
+    scene = Milk(sigma=0.003)
+    found = scene.scan(spec)
+    true = scene.direct.copy()
+    true[:, 64:] *= 0.5
+    off = np.abs(found.direct - true)
+    stated = found.planes["direct_std"]
+    flagged = found.quality & np.uint16(Quality.DISAGREE) != 0
+    assert np.median(off[CLOUDY]) > 0.05 * FULL
+    assert np.mean(off[CLOUDY] > 5 * stated[CLOUDY]) < 0.05
+    assert np.mean(flagged[CLOUDY]) > 0.8
+    assert np.mean(flagged[CLEAR]) < 0.01
+    assert any("scattered or reflected over less" in line for line in found.facts["advice"])
+
+
+@pytest.mark.parametrize("sigma", [0.003, 0.02])
+def test_noise_and_blur_are_not_taken_for_it(sigma: float) -> None:
+    found = Scene(sigma=sigma, blur=0.8, leakage=0.02, ambient=0.02).scan(Checkerboard())
+    assert not np.any(found.quality & np.uint16(Quality.DISAGREE))
+    assert not any("scattered" in line for line in found.facts["advice"])
