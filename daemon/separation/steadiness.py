@@ -117,7 +117,7 @@ def leaks(references: References, leakage: float) -> list[str]:
     if middle > leakage + 0.01 and scatter < min(_PLAIN, 0.5 * contrast):
         return [
             f"black frames have {middle:.3f} of the light of white ones all over the picture, as "
-            f"leakage does and a room's light seldom, but the leakage was told to be {leakage:g}: "
+            f"leakage does and a room's light seldom, but it is taken as {leakage:g}: "
             f"give --leakage {middle:.3f}, or measure it with `umbra calibrate leak`"
         ]
     return []

@@ -146,7 +146,19 @@ def _separate(
     except KeyboardInterrupt:
         say(f"\numbra: stopped; nothing was written to {out}")
         raise
+    if not as_json and given.get("tone") is None and curved(source, match):
+        say(
+            "advice: JPEG files and videos are usually encoded as sRGB, and were taken as linear: "
+            "give --tone srgb, or --tone linear if they are"
+        )
     report(run.info, files, facts, as_json)
+
+
+def curved(source: Path, match: str = "*") -> bool:
+    """Whether the recording is a video, or JPEG: seldom linear, whoever took it."""
+    if source.is_file():
+        return True
+    return any(file.suffix.lower() in (".jpg", ".jpeg") for file in source.glob(match))
 
 
 def _each_exposure(first: Mapping[Reference, list[Path]], exposures: tuple[float, ...]) -> None:

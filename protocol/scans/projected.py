@@ -111,7 +111,7 @@ class SingleImage(PatternScan, frozen=True, kw_only=True, tag="single-image"):
     """One image under fine stripes (§4.4): the peaks and valleys in a window across the stripes are
     interpolated, and averaged over squares: components at 1/reduce of the camera's resolution."""
 
-    stripe: Annotated[int, Meta(ge=1, le=1024, description="width of a stripe, px")] = 2
+    stripe: Annotated[int, Meta(ge=1, le=1024, description="width of a stripe, px")] = 4
     axis: Annotated[Axis, Meta(description=AXIS)] = Axis.X
     window: Annotated[int, Meta(ge=3, le=1001, description="n, camera px across stripes")] = 11
     along: Annotated[int, Meta(ge=1, le=1001, description="m, camera px along stripes")] = 1

@@ -57,7 +57,7 @@ def _specs() -> list[tuple[str, int, AnyScan]]:
         ("random-binary maxmin", 20, RandomBinary(estimator="maxmin", radiometry=light)),
         ("random-binary topk", 20, RandomBinary(estimator="topk", radiometry=light)),
         ("gray-code x", 14, GrayCode(radiometry=light)),
-        ("single-image, 1/4", 1, SingleImage(window=5, radiometry=light)),
+        ("single-image, 1/4", 1, SingleImage(stripe=2, window=5, radiometry=light)),
     ]
 
 

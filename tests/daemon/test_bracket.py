@@ -322,7 +322,7 @@ METHODS: list[AnySeparation] = [
     RandomPhase(phases=4),
     RandomBinary(),
     GrayCode(),
-    SingleImage(reduce=2),
+    SingleImage(stripe=2, reduce=2),
 ]
 
 

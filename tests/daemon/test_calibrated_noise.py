@@ -30,7 +30,7 @@ METHODS = [
     GrayCode(radiometry=LIGHT),
     Sinusoid(phases=3, radiometry=LIGHT),
     Sinusoid(phases=8, radiometry=LIGHT),
-    SingleImage(window=5, radiometry=LIGHT),
+    SingleImage(stripe=2, window=5, radiometry=LIGHT),
 ]
 
 

@@ -55,7 +55,7 @@ def _ratios(scene: Scene | VirtualScene, spec: AnySeparation) -> dict[str, float
         TwoImage(radiometry=LIGHT),
         GrayCode(radiometry=LIGHT),
         Sinusoid(phases=8, radiometry=LIGHT),
-        SingleImage(window=5, radiometry=LIGHT),
+        SingleImage(stripe=2, window=5, radiometry=LIGHT),
     ],
 )
 def test_the_stated_deviation_is_the_real_one(spec: AnySeparation, sigma: float) -> None:

@@ -87,7 +87,7 @@ def test_blurred_stripes_are_left_for_the_next_wider_ones() -> None:
 @pytest.mark.parametrize("axis", list(Axis))
 def test_one_image_separates_at_a_lower_resolution(axis: Axis) -> None:
     scene = Scene(leakage=LEAK)
-    found = scene.scan(SingleImage(axis=axis, window=5, radiometry=radiometry()))
+    found = scene.scan(SingleImage(stripe=2, axis=axis, window=5, radiometry=radiometry()))
     assert found.direct.shape == (24, 32)
     truth = [
         plane.reshape(24, 4, 32, 4).mean(axis=(1, 3)) for plane in (scene.direct, scene.indirect)
@@ -99,8 +99,10 @@ def test_one_image_separates_at_a_lower_resolution(axis: Axis) -> None:
 def test_the_newest_image_of_a_stream_is_the_result() -> None:
     brighter = iter([0.5, 0.7, 0.9])
     scene = Scene(change=lambda light, _: light * next(brighter))
-    found = scene.scan(SingleImage(repeat=3, references=()))
-    still = Scene(change=lambda light, _: light * 0.9).scan(SingleImage(repeat=1, references=()))
+    found = scene.scan(SingleImage(stripe=2, repeat=3, references=()))
+    still = Scene(change=lambda light, _: light * 0.9).scan(
+        SingleImage(stripe=2, repeat=1, references=())
+    )
     np.testing.assert_allclose(found.direct, still.direct, rtol=1e-3)
     assert found.facts["images"] == 3
 
@@ -136,7 +138,7 @@ def test_an_exposure_that_saturates_is_flagged() -> None:
 @pytest.mark.parametrize("pixel_format", [PixelFormat.BAYER_GB16, PixelFormat.RGB16])
 @pytest.mark.parametrize(
     "spec",
-    [*SPECS, SingleImage(window=5, radiometry=radiometry())],
+    [*SPECS, SingleImage(stripe=2, window=5, radiometry=radiometry())],
     ids=lambda s: f"{type(s).__name__}-{s.average}",
 )
 def test_colour_cameras_see_a_grey_scene_in_grey(spec: AnyScan, pixel_format: PixelFormat) -> None:

@@ -166,7 +166,7 @@ def same(one: RunFolder, other: RunFolder) -> bool:
         (TwoImage(), 4),
         (Sinusoid(periods=(8.0, 16.0)), 8),
         (GrayCode(), 14),
-        (SingleImage(repeat=3), 5),
+        (SingleImage(stripe=2, repeat=3), 5),
     ],
     ids=lambda value: getattr(type(value), "__name__", ""),
 )

@@ -58,7 +58,7 @@ def _around_ball(scene: VirtualScene, pixels: int) -> NDArray[np.bool_]:
         (Sinusoid(radiometry=LIGHT), 0.65, 0.005),
         (GrayCode(radiometry=LIGHT), 0.4, 0.02),
         (GrayCode(axes=BOTH, radiometry=LIGHT), 0.9, 0.02),
-        (SingleImage(radiometry=LIGHT), 0.5, 0.005),
+        (SingleImage(stripe=2, radiometry=LIGHT), 0.5, 0.005),
     ],
 )
 def test_the_mirror_is_flagged_and_little_else(
@@ -76,7 +76,7 @@ def test_the_mirror_is_flagged_and_little_else(
 def test_without_black_and_white_a_single_image_says_that_it_looked_for_none(
     scene: VirtualScene,
 ) -> None:
-    components = scene.scan(SingleImage(references=(), radiometry=LIGHT))
+    components = scene.scan(SingleImage(stripe=2, references=(), radiometry=LIGHT))
     assert components.facts["mirrors_looked_for"] is False
 
 
@@ -89,7 +89,7 @@ def test_blur_and_noise_are_no_mirrors(blur: float, sigma: float) -> None:
         RandomPhase(radiometry=LIGHT),
         RandomBinary(radiometry=LIGHT),
         GrayCode(axes=BOTH, radiometry=LIGHT),
-        SingleImage(radiometry=LIGHT),
+        SingleImage(stripe=2, radiometry=LIGHT),
     ]
     for spec in specs:
         found = scene.scan(spec)

@@ -57,7 +57,7 @@ METHODS: dict[str, AnySeparation] = {
     "sinusoid 5 x 2": Sinusoid(phases=5, periods=(12, 20), radiometry=LIGHT),
     "gray-code x": GrayCode(bits=7, radiometry=LIGHT),
     "gray-code x,y": GrayCode(axes=BOTH, bits=7, radiometry=LIGHT),
-    "single-image": SingleImage(radiometry=LIGHT),
+    "single-image": SingleImage(stripe=2, radiometry=LIGHT),
 }
 ALL = tuple(METHODS)
 SETS = ALL[:-1]  # of more than one image

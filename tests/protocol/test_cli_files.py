@@ -13,6 +13,7 @@ import pytest
 
 from protocol.cli.delivery import Delivery, make_folder
 from protocol.cli.picture import in_terminal, png
+from protocol.cli.separate import curved
 from protocol.cli.private import configured, toml
 from protocol.cli.separate import as_typed
 from protocol.errors import UmbraError
@@ -163,3 +164,11 @@ def test_what_a_quick_command_does_not_import(arguments: list[str], absent: list
 def test_a_recordings_keys_are_named_as_they_were_typed() -> None:
     said = as_typed("no images that match 'x*'; check `path` and `match`, leave `loop` out")
     assert said == "no images that match 'x*'; check DIR and --match, leave `loop` out"
+
+
+def test_jpeg_and_video_are_seldom_linear(tmp_path: Path) -> None:
+    for name in ("a.png", "b.JPG", "stick.avi"):
+        (tmp_path / name).touch()
+    assert curved(tmp_path)
+    assert curved(tmp_path / "stick.avi")
+    assert not curved(tmp_path, "*.png")
