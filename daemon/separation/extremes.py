@@ -66,6 +66,7 @@ class Extremes:
         self._high = Ranked(keep, largest=True)
         self._waves = None if weights is None else WaveSums(weights)
         self._order = None if levels is None else OrderStatistics(levels, response, average, shifts)
+        self._shifted = shifts is not None
         self._references = References(response)
         self._noise = ScanNoise(response, average)
         self._mean = FrameMean(response) if average > 1 else None
@@ -173,7 +174,7 @@ class Extremes:
                 judgement = Judgement(direct_limit, total_limit, own)
             if len(low) > 1:
                 own = found.deviation * np.float32(1.0 / found.uneven)
-                uneven = unevenness(low, high, own, planes, patterns)
+                uneven = unevenness(low, high, own, planes, patterns, shifted=self._shifted)
                 planes, advice = uneven.planes, advice + uneven.advice
                 flags = uneven.flags if flags is None else flags | uneven.flags
         saturated = self._saturated

@@ -20,8 +20,9 @@ from daemon.separation.finish import bits
 from daemon.separation.radiometry import Plane
 from daemon.separation.sampling import thinned
 
-_BOX = (9, 9)  # pixels that a spread is averaged over: noise moves their mean by 3 % ...
+_BOX = 9  # pixels across that a spread is averaged over: noise moves their mean by 3 % ...
 _SURE = 1.1  # ... and by more than three times that hardly ever
+_PATCHES = 25  # pixels across: edges of random patches are blurred, and must be in each mean
 _CALM = 0.25  # of the bright pixels have no larger spread by blur and place ...
 _USUAL = 2.2  # ... and hardly any has so many times theirs
 _BRIGHT = 0.2  # of the largest steps: where the usual spread is looked for
@@ -48,15 +49,22 @@ class Uneven:
 
 
 def unevenness(
-    low: Plane, high: Plane, noise: Plane, planes: dict[str, Plane], patterns: int
+    low: Plane,
+    high: Plane,
+    noise: Plane,
+    planes: dict[str, Plane],
+    patterns: int,
+    *,
+    shifted: bool,
 ) -> Uneven:
     """What the ranks of samples differ by beyond noise and what is usual in the scene.
 
     `low`, `high` (K, H, W[, 3]): the light of the darkest and brightest samples of so many
     patterns, the most extreme first; `noise` (H, W[, 3]): the deviation of a sample; `planes`:
-    those of the components by noise alone. All float32.
+    those of the components by noise alone. All float32. `shifted`: each pixel has been at every
+    place of one pattern; under random patches blur moves those at edges, and not the others.
     """
-    error = _error(low, high, noise, patterns)
+    error = _error(low, high, noise, patterns, _BOX if shifted else _PATCHES)
     known = np.maximum.reduce(list(planes.values()))
     much = error > np.maximum(np.float32(_DEVIATIONS) * known, np.float32(_PART) * high[0])
     pixels = much if much.ndim == 2 else np.logical_or.reduce(much, axis=2)
@@ -70,12 +78,15 @@ def unevenness(
     )
 
 
-def _error(low: Plane, high: Plane, noise: Plane, patterns: int) -> Plane:
+def _error(low: Plane, high: Plane, noise: Plane, patterns: int, across: int) -> Plane:
     step = np.maximum(high[0] - low[0], _TINY)
-    around = _mean(step)
-    spread = np.square(_mean((high[0] - high[-1]) + (low[-1] - low[0])))
-    of_noise = np.square(_mean(noise) * np.float32(2.0 * _distance(len(low), patterns // 2)))
-    bright, share = thinned(step), thinned(np.maximum(spread - of_noise, 0) / np.square(around))
+    around = _mean(step, across)
+    spread = np.square(_mean((high[0] - high[-1]) + (low[-1] - low[0]), across))
+    of_noise = np.square(
+        _mean(noise, across) * np.float32(2.0 * _distance(len(low), patterns // 2))
+    )
+    bright = thinned(step)
+    share = thinned(np.maximum(spread - of_noise, 0) / np.square(around))
     lit = bright >= np.float32(_BRIGHT) * np.quantile(bright, 0.99)
     usual = np.float32(_USUAL**2 * np.quantile(share[lit], _CALM))
     spread -= np.float32(_SURE**2) * of_noise + usual * np.square(around)
@@ -84,8 +95,9 @@ def _error(low: Plane, high: Plane, noise: Plane, patterns: int) -> Plane:
     return np.asarray(np.float32(_ERROR) * part * step, dtype=np.float32)
 
 
-def _mean(plane: Plane) -> Plane:
-    return np.asarray(cv2.blur(plane, _BOX, borderType=cv2.BORDER_REFLECT), dtype=np.float32)
+def _mean(plane: Plane, across: int) -> Plane:
+    mean = cv2.blur(plane, (across, across), borderType=cv2.BORDER_REFLECT)
+    return np.asarray(mean, dtype=np.float32)
 
 
 def _distance(keep: int, samples: int) -> float:

@@ -60,3 +60,10 @@ def test_noise_and_blur_are_not_taken_for_it(sigma: float) -> None:
     found = Scene(sigma=sigma, blur=0.8, leakage=0.02, ambient=0.02).scan(Checkerboard())
     assert not np.any(found.quality & np.uint16(Quality.DISAGREE))
     assert not any("scattered" in line for line in found.facts["advice"])
+
+
+def test_blurred_edges_of_random_patches_are_not_taken_for_it() -> None:
+    """Of patches that are large in the picture, so that most pixels see no edge."""
+    found = Scene(sigma=0.003, blur=1.6).scan(RandomBinary(patch=12))
+    assert np.mean(found.quality & np.uint16(Quality.DISAGREE) != 0) < 0.01
+    assert not any("scattered" in line for line in found.facts["advice"])

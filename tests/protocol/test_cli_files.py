@@ -13,9 +13,8 @@ import pytest
 
 from protocol.cli.delivery import Delivery, make_folder
 from protocol.cli.picture import in_terminal, png
-from protocol.cli.separate import curved
 from protocol.cli.private import configured, toml
-from protocol.cli.separate import as_typed
+from protocol.cli.separate import as_typed, curved
 from protocol.errors import UmbraError
 
 
