@@ -103,12 +103,6 @@ class Plan:
     blur_mm: float  # way of the mesh in an exposure
 
 
-def penumbra_mm(scene_mm: float, *, source_deg: float) -> float:
-    """Width of the penumbra, in the mesh's plane, of a source of an angular diameter as seen from
-    the scene, `scene_mm` behind the mesh."""
-    return scene_mm * 2.0 * math.tan(math.radians(source_deg) / 2.0)
-
-
 @lru_cache(maxsize=512)
 def circle(mesh: Mesh, radius_mm: float, penumbra: float = 0.0) -> Circle:
     """What a circle of a radius does for the worst of all points of a unit cell."""

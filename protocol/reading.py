@@ -25,8 +25,8 @@ READ = frozenset({
     "black", "tone", "leakage", "saturation", "lit_fraction", "estimator",
     # what a moving occluder's frames are used for: decided again
     "sun", "align",
-    # the mesh: how it is made, not how it moved
-    "hole_fraction", "hole_mm", "pitch_mm", "grid", "scene_mm", "source_deg",
+    # the occluder: how it is made and where it is, not how it moved
+    "hole_fraction", "hole_mm", "pitch_mm", "grid", "width_mm", "scene_mm", "source_deg",
     # of a single image
     "window", "along", "reduce",
     # of an advice

@@ -13,6 +13,7 @@ from daemon.separation.estimator import Components, Estimator
 from daemon.separation.mesh import MeshOccluder
 from daemon.separation.steadied import Steadied
 from protocol import mesh as geometry
+from protocol.penumbra import penumbra_mm
 from protocol.scans.occluded import Mesh
 from protocol.scans.spec import Reference
 
@@ -93,7 +94,7 @@ class MeshMethod(OccluderMethod[Mesh]):
         Raises Unsuitable where no circle covers every point.
         """
         assert bench.stage is not None
-        penumbra = geometry.penumbra_mm(spec.scene_mm or 0.0, source_deg=spec.source_deg)
+        penumbra = penumbra_mm(spec.scene_mm or 0.0, source_deg=spec.source_deg)
         rate = spec.frame_rate_hz or min(bench.camera.max_rate_hz or _RATE_HZ, _RATE_HZ)
         exposure_us = spec.exposure_us or bench.exposure_us
         exposure = exposure_us * 1e-6 if exposure_us else min(_EXPOSURE_S, 1.0 / rate)

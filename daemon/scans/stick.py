@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar
 
 from daemon.scans.method import Bench, Sweep, Unsuitable
 from daemon.scans.occluder import OccluderMethod
 from daemon.separation.coverage import Occluder
-from daemon.separation.estimator import Estimator
+from daemon.separation.estimator import Components, Estimator
 from daemon.separation.steadied import Steadied
 from drivers.base.stage import StageInfo
 from protocol.patterns import Axis
+from protocol.penumbra import beside_a_stick, penumbra_mm
 from protocol.scans.occluded import Stick
 
 _SWEEP_S = 10.0  # of a sweep, where no feed is told
@@ -42,6 +44,34 @@ class StickMethod(OccluderMethod[Stick]):
             ),
             few=True,
         )
+
+    def conclude(self, components: Components) -> Components:
+        """See `Method`: with what geometry says of the umbra."""
+        components = super().conclude(components)
+        umbra, advice = _umbra(self.spec)
+        advice = [*components.facts.get("advice", []), *advice]
+        return replace(components, facts={**components.facts, **umbra, "advice": advice})
+
+
+def _umbra(spec: Stick) -> tuple[dict[str, Any], list[str]]:
+    """Facts of the darkest shadow that the stick can cast, and advice where it is no umbra."""
+    if spec.width_mm is None or spec.scene_mm is None:
+        told = "not known: say the stick's width and its distance to the scene"
+        return {"leakage_from": f"{told} (--width-mm, --scene-mm)"}, []
+    penumbra = penumbra_mm(spec.scene_mm, source_deg=spec.source_deg)
+    leak = beside_a_stick(spec.width_mm, penumbra)
+    facts = {
+        "penumbra_mm": round(penumbra, 3),
+        "leakage_at_most": round(leak, 4),
+        "leakage_from": "the stick's geometry",
+    }
+    if leak == 0.0:
+        return facts, []
+    return facts, [
+        f"{leak:.0%} of the source still shines past the stick, which is {spec.width_mm:g} mm wide "
+        f"in a penumbra of {penumbra:.2g} mm: that part of direct counts as global; take a wider "
+        "stick, or hold it nearer to the scene"
+    ]
 
 
 def _sweep(spec: Stick, stage: StageInfo) -> Sweep:

@@ -11,6 +11,7 @@ import typer
 from protocol.cli.link import Json
 from protocol.cli.output import print_facts, print_json
 from protocol.errors import Code, UmbraError
+from protocol.penumbra import penumbra_mm
 from protocol.scans.occluded import SUN_DEG, Grid
 
 app = typer.Typer(rich_markup_mode=None, add_completion=False)
@@ -67,7 +68,7 @@ def mesh(
         raise UmbraError(Code.BAD_REQUEST, "exposure, frame rate, feed and radius are above 0")
     try:
         sheet = geometry.Mesh(hole, pitch, grid)
-        penumbra = geometry.penumbra_mm(scene, source_deg=source)
+        penumbra = penumbra_mm(scene, source_deg=source)
         best = geometry.plan(
             sheet,
             penumbra=penumbra,

@@ -69,6 +69,14 @@ class Stick(OccluderScan, frozen=True, kw_only=True, tag="stick"):
         Annotated[tuple[float, float], Meta(description="from where to where on that axis, mm")]
         | None
     ) = None
+    width_mm: Annotated[Positive, Meta(description="of the stick, for the penumbra")] | None = None
+    scene_mm: (
+        Annotated[float, Meta(ge=0.0, description="from the stick to the scene, for the penumbra")]
+        | None
+    ) = None
+    source_deg: Annotated[
+        float, Meta(ge=0.0, lt=90.0, description="angular diameter of the source; sun 0.53")
+    ] = SUN_DEG
 
 
 class Mesh(OccluderScan, frozen=True, kw_only=True, tag="mesh"):

@@ -9,7 +9,7 @@ import pytest
 
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Method, Taken, Unsuitable, Watch
-from daemon.separation.estimator import Lighting
+from daemon.separation.estimator import Components, Lighting
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
@@ -143,6 +143,21 @@ def test_a_stick_is_watched_to_the_end_of_the_recording() -> None:
     assert method.planned() == 166
     assert steps(catalog.method_for(Stick(), recorded(None))) == [Watch(None)]
     assert steps(catalog.method_for(Stick(frames=40), live(None))) == [Watch(40)]
+
+
+@pytest.mark.parametrize(("width_mm", "leak"), [(None, None), (3.0, 0.0), (0.5, 0.6602)])
+def test_a_stick_thinner_than_the_penumbra_is_told(
+    width_mm: float | None, leak: float | None
+) -> None:
+    spec = Stick(width_mm=width_mm, scene_mm=200.0)
+    method = catalog.method_for(spec, recorded(166))
+    plane = np.zeros((2, 2), np.float32)
+    facts = {"advice": ["look"]}
+    found = method.conclude(Components(plane, plane, plane.astype(np.uint16), {}, facts)).facts
+    assert found.get("leakage_at_most") == (leak if leak is None else pytest.approx(leak, abs=1e-3))
+    assert ("not known" in found["leakage_from"]) == (leak is None)
+    assert found["advice"][0] == "look"
+    assert any("shines past the stick" in line for line in found["advice"]) == bool(leak)
 
 
 @pytest.mark.parametrize(

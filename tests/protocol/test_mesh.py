@@ -10,6 +10,7 @@ import pytest
 from protocol import mesh as geometry
 from protocol.cli.app import run
 from protocol.mesh import Mesh
+from protocol.penumbra import penumbra_mm
 from protocol.scans.occluded import SUN_DEG, Grid
 
 SQUARE = Mesh(6.25, 10.0)
@@ -44,7 +45,7 @@ def test_the_hole_fraction_is_that_of_the_drawing(grid: Grid) -> None:
 
 
 def test_a_penumbra_costs_time_in_light_and_at_last_everything() -> None:
-    sun = geometry.penumbra_mm(400.0, source_deg=SUN_DEG)
+    sun = penumbra_mm(400.0, source_deg=SUN_DEG)
     assert sun == pytest.approx(0.00925 * 400, rel=0.01)
     sharp, soft = (geometry.circle(SQUARE, 9.0, width) for width in (0.0, 1.0))
     assert soft.lit < sharp.lit
