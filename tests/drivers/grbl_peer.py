@@ -72,6 +72,9 @@ class Block:
     jog: bool = False
 
 
+GONE = "/dev/pts/gone"
+
+
 class GrblPeer:
     """Use as a context manager. `link` is the stable name; the tty behind it may change."""
 
@@ -131,7 +134,9 @@ class GrblPeer:
         self.link.symlink_to(self.name)
 
     def unplug(self) -> None:
-        """Vanish; the link stays behind, dangling."""
+        """Vanish; the link stays behind, dangling: at no name that another test's tty may get."""
+        self.link.unlink(missing_ok=True)
+        self.link.symlink_to(GONE)
         if self._spare is None and not self._stop.is_set():
             self._spare = _new_pty()  # taken while the old name is in use: it will be another
         with self._lock:

@@ -62,6 +62,7 @@ class TmclPeer:
         os.set_blocking(self._master, False)
 
     def unplug(self) -> None:
+        self.link.unlink(missing_ok=True)  # its tty's name may soon be that of another test's
         master, self._master = self._master, -1
         os.close(master)
         self._out.clear()
@@ -75,7 +76,7 @@ class TmclPeer:
         self._stop.set()
         self._thread.join()
         if self._master >= 0:
-            os.close(self._master)
+            self.unplug()
 
     def _run(self) -> None:
         last = time.monotonic()
