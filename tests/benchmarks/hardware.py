@@ -97,9 +97,9 @@ def _bandwidth() -> Iterator[Ratio]:
         best, used_s, frames = 0.0, math.nan, 0
         for rate in rates:
             before = _cpu_s(rig)
-            info = rig.client.scan(Stick(frames=round(rate * SECONDS), frame_rate_hz=rate)).wait(
-                120, check=False
-            )
+            info = rig.client.scan(
+                Stick(frames=round(rate * SECONDS), frame_rate_hz=rate, align=False)  # it moves
+            ).wait(120, check=False)
             records = FrameStore.open(rig.data / "runs" / info.id, readonly=True).records()
             whole = [r for r in records if r.sequence >= 0]
             if info.missing or len(whole) < round(rate * SECONDS):
