@@ -23,7 +23,9 @@ Mask = NDArray[np.bool_]
 _NEAR = 5  # pixels across: parts of a pattern so near to each other leave an edge between
 _WHOLE = 0.93  # of the contrast nearby: less is an edge's
 _TOLD = 3.0  # deviations of noise
+_LIFTED = 1.0  # deviations, at least, by which noise lifts the largest of so many contrasts
 _ALIKE = 0.95  # length of the mean of phases that are alike
+_NOISE = 1.3  # times what noise makes of a neighbourhood's variance, which is told to a fifth
 _REACHES = (5, 9, 17)  # pixels across, within which whole neighbours are looked for
 _SOME = 0.1  # of the weight there must be theirs
 
@@ -51,7 +53,7 @@ def edges(contrast: Plane, noise: Plane, between: Mask, *, mosaic: bool) -> Mask
         kernel[1::2, :] = kernel[:, 1::2] = 0
     most = np.asarray(cv2.dilate(contrast, kernel))
     short = most * np.float32(_WHOLE) - contrast
-    return np.asarray(between & (short > np.float32(_TOLD) * noise))
+    return np.asarray(between & (short > np.float32(_TOLD + _LIFTED) * noise))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,8 @@ def as_neighbours(direct: Plane, total: Plane, noise: Plane, edge: Mask, *, mosa
     weight: Plane = light * _as(~edge, light).astype(np.float32)
     by = np.float32(1.0) / np.maximum(light, np.float32(1e-3))
     part: Plane = np.clip(direct * by, 0.0, 1.0)
-    square: Plane = np.square(part) - np.square(np.minimum(noise * by, np.float32(1.0)))
+    of_noise = np.float32(_NOISE) * np.square(np.minimum(noise * by, np.float32(1.0)))
+    square: Plane = np.square(part) - of_noise
     found, deviation = direct.copy(), np.zeros_like(direct)
     left = _near(edge)
     for reach in _REACHES:
