@@ -63,23 +63,30 @@ def fading(
     direct: Plane,
     total: Plane,
     direct_std: Plane,
+    *,
+    lost: float,
 ) -> Faded:
     """What fading leaves unsure of `direct` light, a part of the `total`, whose deviation by noise
     is `direct_std`, all of a frame's shape; `edge` (H, W): pixels whose contrast does not tell. The
-    rest as in `faded`.
+    rest as in `_faded`.
 
-    Of light that goes with the pattern so anything up to all of it may be direct.
+    Of light that goes with the pattern so anything up to all of it may be direct. Where blur leaves
+    no pixel whole, those that are taken for whole lack some, too: `lost` of the usual fading.
     """
-    part = faded(wave, contrast, noise, ~edge) * np.float32(3**-0.5)
+    part, usual = _faded(wave, contrast, noise, ~edge)
+    part *= np.float32(3**-0.5)
     off: Plane = (part if direct.ndim == 2 else part[..., None]) * direct
     much = off > np.maximum(np.float32(_DEVIATIONS) * direct_std, np.float32(_PART) * total)
     pixels = much if much.ndim == 2 else np.logical_or.reduce(much, axis=2)
     many = float(np.mean(pixels))
-    return Faded(off, bits(pixels, Quality.DISAGREE), [_SAID.format(many)] if many > _MANY else [])
+    advice = [_SAID.format(many)] if many > _MANY else []
+    np.hypot(off, direct * np.float32(lost * usual), out=off)
+    return Faded(off, bits(pixels, Quality.DISAGREE), advice)
 
 
-def faded(wave: Wave, contrast: Plane, noise: Plane, whole: Mask) -> Plane:
-    """The part of each pixel's contrast (H, W), 0 to 1, that may not be direct light's.
+def _faded(wave: Wave, contrast: Plane, noise: Plane, whole: Mask) -> tuple[Plane, float]:
+    """The part of each pixel's contrast (H, W), 0 to 1, that may not be direct light's; and the
+    usual fading, by blur: the part of a contrast that it loses where the scattered pattern is 0.
 
     `wave` (H, W) complex: the pattern as seen, of any amplitude; `contrast`, a part of the light of
     deviation `noise`; `whole`: pixels at no edge, whose contrast tells.
@@ -89,7 +96,7 @@ def faded(wave: Wave, contrast: Plane, noise: Plane, whole: Mask) -> Plane:
     turn = np.where(seen, wave / np.maximum(np.abs(wave), np.float32(1e-6)), 0)
     size = _patch(turn, seen)
     if size is None:
-        return none
+        return none, 0.0
     scattered = _scattered(turn, seen, _REACH * size)
     weight = (whole & seen).astype(np.float32)
     across = int(_ACROSS * size) // 2 * 2 + 1
@@ -105,18 +112,19 @@ def faded(wave: Wave, contrast: Plane, noise: Plane, whole: Mask) -> Plane:
     told = (count > np.float32(_SOME)) & (spread > _EVEN)
     lit = told & (weight > 0) & (level > np.float32(_BRIGHT) * np.quantile(contrast, 0.99))
     if not lit.any():
-        return none
+        return none, 0.0
     spread[~told], level[~told] = 1.0, 1.0
     going = mean(contrast * scattered) - level * middle
     slope = going / (spread * level)
     # what lies otherwise than the pattern may do so by chance, in as many ways as there are patches
     other = mean(np.square(contrast)) - np.square(level) - np.square(going) / spread
     of_chance = np.maximum(other, 0) / (np.square(level) * spread * np.float32(_ACROSS**2))
-    more = slope - np.float32(gathered(slope[lit]))
-    usual = np.float32((_CORE * np.quantile(np.abs(more[lit]), 0.25)) ** 2)
-    beyond = np.square(np.maximum(more, 0)) - np.float32(_SURE**2) * np.maximum(usual, of_chance)
+    usual = gathered(slope[lit])
+    more = slope - np.float32(usual)
+    core = np.float32((_CORE * np.quantile(np.abs(more[lit]), 0.25)) ** 2)
+    beyond = np.square(np.maximum(more, 0)) - np.float32(_SURE**2) * np.maximum(core, of_chance)
     part: Plane = np.where(told, np.sqrt(np.clip(beyond, 0, 1)), np.float32(0))
-    return part
+    return part, max(usual, 0.0)
 
 
 def _patch(turn: Wave, seen: Mask) -> float | None:

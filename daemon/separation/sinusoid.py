@@ -40,6 +40,7 @@ _DISTORTED = 0.05
 _BENT = 0.03  # of the wave: with more of it in its amplitude thrice a period, light was no sinusoid
 _ODD = 0.05  # with more of it in mean or amplitude once a period, frames are not of these phases
 _MANY = 0.2  # of the pixels
+_LOST = 0.25  # of the usual fading: patches of 4 px lack it in their middles
 
 
 class LeastSquares:
@@ -115,7 +116,9 @@ class LeastSquares:
         between: dict[str, Any] = {}
         faded: list[str] = []
         if self._patches:
-            split, fade = self._between_patches(ready[0], noise, direct, total, noises[0])
+            split, fade = self._between_patches(
+                ready[0], noise, direct, total, noises[0], np.sqrt(total_var)
+            )
             direct = split.direct
             noises = split.noise(*noises, total, np.sqrt(total_var))
             off += [split.deviation, fade.off]
@@ -210,7 +213,13 @@ class LeastSquares:
         return total.light, variance, total.source
 
     def _between_patches(
-        self, fit: WaveFit, noise: Told, direct: Plane, total: Plane, deviation: Plane
+        self,
+        fit: WaveFit,
+        noise: Told,
+        direct: Plane,
+        total: Plane,
+        direct_std: Plane,
+        total_std: Plane,
     ) -> tuple[Split, Faded]:
         """Random phases: what the edges of patches have too little of, and what scattering leaves
         unsure, see `straddling` and `fading`."""
@@ -221,8 +230,11 @@ class LeastSquares:
         mosaic = bool(self._response.bayer)
         own = self._grey_noise(fit, noise) / light
         edge = edges(contrast, own, between, mosaic=mosaic)
-        split = as_neighbours(direct, total, deviation, edge, mosaic=mosaic)
-        return split, fading(wave, contrast, own, edge, split.direct, total, deviation)
+        part = np.clip(direct / np.maximum(total, np.float32(1e-3)), 0, 1)
+        of_part = np.hypot(direct_std, part * total_std)
+        split = as_neighbours(direct, total, of_part, edge, mosaic=mosaic)
+        fade = fading(wave, contrast, own, edge, split.direct, total, direct_std, lost=_LOST)
+        return split, fade
 
     def _grey_noise(self, fit: WaveFit, noise: Told) -> Plane:
         """Of the wave's amplitude (H, W), colours added."""

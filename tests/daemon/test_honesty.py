@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from daemon.separation.deviation import of_noise
 from daemon.separation.estimator import Quality
-from daemon.separation.sinusoid import LeastSquares
 from protocol.scans.anyscan import AnySeparation
 from protocol.scans.projected import (
     Checkerboard,
@@ -25,21 +25,16 @@ SCANS = 6
 UNSURE = Quality.SATURATED | Quality.DARK | Quality.LOW_MODULATION | Quality.RESIDUE
 
 
-@pytest.fixture(autouse=True)
-def _noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Repeated scans do not show what an unsure blur adds to the deviations of sinusoids."""
-    monkeypatch.setattr(LeastSquares, "_doubt", lambda *_: 0.0)
-
-
 def _ratios(scene: Scene | VirtualScene, spec: AnySeparation) -> dict[str, float]:
-    """Stated over real deviation of direct and of global: medians over good pixels."""
+    """Stated over real deviation of direct and of global by noise, which is what repeated scans
+    show: medians over good pixels."""
     scans = [scene.scan(spec, seed=seed) for seed in range(SCANS)]
     good = np.all([(scan.quality & np.uint16(UNSURE)) == 0 for scan in scans], axis=0)
     assert good.mean() > 0.2
     found = {}
     for name, plane in (("direct", "direct_std"), ("global_", "global_std")):
         real = np.stack([getattr(scan, name) for scan in scans]).var(axis=0, ddof=1)[good]
-        stated = np.stack([scan.planes[plane] for scan in scans]).mean(axis=0)[good]
+        stated = np.stack([of_noise(scan.planes, plane) for scan in scans]).mean(axis=0)[good]
         mean = np.median(real) / (1 - 2 / (9 * (SCANS - 1))) ** 3  # of a χ², from its median
         found[name] = float(np.median(stated) / np.sqrt(mean))
     return found
