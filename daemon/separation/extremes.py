@@ -29,6 +29,12 @@ from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import HALF, compare
 from daemon.separation.uneven import Uneven, unevenness
 
+NOT_LIT_OR_UNLIT = (
+    "nearly every pixel has many samples between its darkest and its brightest: the frames are no "
+    "patterns of lit and unlit patches (sinusoids are a method of their own, -m sinusoid), or the "
+    "patches are so blurred that hardly a pixel is in one (--patch)"
+)
+
 
 class Extremes:
     """Lit and unlit light over patterns of one lit fraction -> direct, global (Eq. 8).
@@ -203,10 +209,18 @@ class Extremes:
                 **facts,
                 **mirrors.facts,
                 **steady,
-                "advice": ([] if mirrors.as_declared else [NOT_SHIFTS]) + advice + told.advice(),
+                "advice": self._declared(mirrors, told) + advice + told.advice(),
                 **self._references.facts(source),
             },
         )
+
+    def _declared(self, mirrors: Mirrors, told: Told) -> list[str]:
+        """A line where the frames are not the patterns that were declared."""
+        if not mirrors.as_declared:
+            return [NOT_SHIFTS]
+        if self._shifted or self._order is None or self._order.of_two_levels(told):
+            return []
+        return [NOT_LIT_OR_UNLIT]
 
     def _light(self, samples: NDArray[Any]) -> Plane:
         return self._response.linear(samples) if self._mean is None else samples

@@ -35,6 +35,8 @@ _PLACE = ("lit_place", "unlit_place", "shared_place")
 _GROUPS = 8
 _LEAST = 32  # pixels that make a group
 _DIM = 0.2  # of the brightest pixels' step: with less, a pixel is not looked at
+_TOLD = 10.0  # deviations of noise, of a step whose samples are looked at
+_BETWEEN = 0.16  # of a place's samples: a wave has a third of them in the middle half of its step
 _WITHIN = 1.5  # times the distance of the kept ranks from an end of the scale, to be clear of it
 _FINE = 640  # ratios of noise and step that are told apart, evenly in their logarithm
 _FIRST = 1.6  # deviations that the first of a dozen samples is off
@@ -80,6 +82,19 @@ class OrderStatistics:
     def told(self, noise: ScanNoise) -> Told:
         """What is known of the noise by now."""
         return noise.told(self._residual or self._noise())
+
+    def of_two_levels(self, told: Told) -> bool:
+        """Whether the samples followed can be lit and unlit ones: under patterns of many levels
+        samples of nearly every place lie between its darkest and its brightest."""
+        light = self._followed.light()
+        low, high = light.min(axis=0), light.max(axis=0)
+        step = high - low
+        seen = step > np.maximum(_DIM * np.quantile(step, 0.9), _TOLD * told.deviation(high))
+        if np.count_nonzero(seen) < _LEAST:
+            return True
+        quarter = np.float32(0.25) * step
+        between = np.mean((light > low + quarter) & (light < high - quarter), axis=0)
+        return float(np.quantile(between[seen], 0.1)) < _BETWEEN
 
     def estimate(self, low: Plane, high: Plane, told: Told) -> Estimated:
         """Lit and unlit light of each pixel, from the light (keep, ...) of its darkest and its
