@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from daemon.separation import light_model
 from daemon.separation.deviation import stated
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
-from daemon.separation.fading import fading
+from daemon.separation.fading import HALVES, fading
 from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.handedness import strength
 from daemon.separation.radiometry import FrameMean, Plane, Response
@@ -19,8 +19,6 @@ from daemon.separation.residue import mirrored
 from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import compare
 from daemon.separation.straddling import as_neighbours, between_halves, edges
-
-_LOST = 0.1  # of the usual fading: checkers of 8 px lack it in their middles
 
 
 class ComplementPair:
@@ -88,7 +86,7 @@ class ComplementPair:
         direct, indirect = split.direct, total - split.direct
         noises = split.noise(direct_std, global_std, total, direct_std)
         waves = [wave.astype(np.complex64)]
-        fade = fading(waves[0], contrast, noise * part, edge, direct, total, noises[0], lost=_LOST)
+        fade = fading(waves[0], contrast, noise * part, direct, total, noises[0], blur=HALVES)
         planes = stated(*noises, split.deviation, fade.off)
         flags = bits(split.known, Quality.EDGE) | bits(edge & ~split.known, Quality.LOW_MODULATION)
         flags |= fade.flags

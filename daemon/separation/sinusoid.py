@@ -18,7 +18,7 @@ from daemon.separation import correspondence
 from daemon.separation.coordinates import other_axis
 from daemon.separation.deviation import stated
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
-from daemon.separation.fading import Faded, fading
+from daemon.separation.fading import PHASES, Faded, fading
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import STRONG, strength
 from daemon.separation.periods import agreed
@@ -40,7 +40,6 @@ _DISTORTED = 0.05
 _BENT = 0.03  # of the wave: with more of it in its amplitude thrice a period, light was no sinusoid
 _ODD = 0.05  # with more of it in mean or amplitude once a period, frames are not of these phases
 _MANY = 0.2  # of the pixels
-_LOST = 0.25  # of the usual fading: patches of 4 px lack it in their middles
 
 
 class LeastSquares:
@@ -137,12 +136,13 @@ class LeastSquares:
         if moved is not None:
             quality |= moved
         misfit = self._noise.misfit
-        disagreeing = float(np.mean((quality & np.uint16(Quality.DISAGREE)) != 0))
+        disagreeing = float(np.mean(solved.disagree))
         facts: dict[str, Any] = {
             "estimator": "lsq",
             "patterns": sum(fit.frames for fit in self._fits),
             "frequencies": len(ready),
             **blur.facts(),
+            "scattering_looked_for": len(ready) > 1 or self._patches,
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
@@ -233,7 +233,7 @@ class LeastSquares:
         part = np.clip(direct / np.maximum(total, np.float32(1e-3)), 0, 1)
         of_part = np.hypot(direct_std, part * total_std)
         split = as_neighbours(direct, total, of_part, edge, mosaic=mosaic)
-        fade = fading(wave, contrast, own, edge, split.direct, total, direct_std, lost=_LOST)
+        fade = fading(wave, contrast, own, split.direct, total, direct_std, blur=PHASES)
         return split, fade
 
     def _grey_noise(self, fit: WaveFit, noise: Told) -> Plane:
@@ -316,8 +316,9 @@ def _advice(
         )
     if disagreeing > _MANY:
         lines.append(
-            f"the periods give different direct light in {disagreeing:.0%} of the pixels: the "
-            "frames are not the phases and periods that were declared (--phases, --periods), or "
-            "the coarser patterns are too coarse for this scene"
+            f"the periods give different direct light in {disagreeing:.0%} of the pixels: light is "
+            "scattered or reflected over less than a period there, and direct may be too large by "
+            "about the stated deviation (finer --periods tell), or the frames are not the phases "
+            "and periods that were declared (--phases, --periods)"
         )
     return lines

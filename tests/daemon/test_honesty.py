@@ -12,6 +12,7 @@ from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
     RandomBinary,
+    RandomPhase,
     SingleImage,
     Sinusoid,
     TwoImage,
@@ -67,6 +68,33 @@ def test_what_blur_does_is_stated_too(spec: AnySeparation, blur: float) -> None:
     off = np.abs(found.direct - scene.direct) / found.planes["direct_std"]
     assert 0.5 < np.median(off) / 0.6745 < 1.8
     assert np.mean(off > 5) < 0.02
+
+
+@pytest.mark.parametrize("blur", [0.0, 0.6, 1.2])
+@pytest.mark.parametrize(
+    "spec",
+    [
+        Checkerboard(estimator="maxmin", radiometry=LIGHT),
+        Checkerboard(estimator="topk", radiometry=LIGHT),
+        RandomBinary(estimator="maxmin", radiometry=LIGHT),
+        RandomBinary(estimator="topk", radiometry=LIGHT),
+        TwoImage(radiometry=LIGHT),
+        RandomPhase(radiometry=LIGHT),
+        GrayCode(radiometry=LIGHT),
+        Sinusoid(phases=5, periods=(12, 20), radiometry=LIGHT),
+    ],
+)
+def test_it_is_that_of_the_error(spec: AnySeparation, blur: float) -> None:
+    """Against the truth: noise, bias, place in the pattern, edges and blur together."""
+    scene = Scene(sigma=0.02, leakage=0.02, ambient=0.03, blur=blur)
+    found = scene.scan(spec)
+    inside = np.s_[8:-8, 8:-8]
+    for plane, truth, name in (
+        (found.direct, scene.direct, "direct_std"),
+        (found.global_, scene.indirect, "global_std"),
+    ):
+        error = np.mean(np.square(plane - truth)[inside])
+        assert 0.75 < np.sqrt(error / np.mean(np.square(found.planes[name][inside]))) < 1.35, name
 
 
 @pytest.mark.parametrize("spec", [Sinusoid(phases=8, radiometry=LIGHT), GrayCode(radiometry=LIGHT)])
