@@ -27,7 +27,7 @@ from daemon.runs.calibration import Calibrations
 from daemon.runs.preconditions import LightWatch, Precondition, Preconditions
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Method
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import response_of
 from daemon.separation.metering import Exposure, Level
 from daemon.storage.runfolder import RunFolder
 from daemon.storage.store import Store, estimate_bytes

@@ -28,8 +28,17 @@ from daemon.runs.ending import close, end_of, utc_now, with_exposure
 from daemon.runs.failures import as_error
 from daemon.runs.preparation import as_exposed
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Bench, Circle, Expose, Method, Step, Taken, Unsuitable, Watch
-from daemon.scans.occluder import INCOMPLETE
+from daemon.scans.method import (
+    INCOMPLETE,
+    Bench,
+    Circle,
+    Expose,
+    Method,
+    Step,
+    Taken,
+    Unsuitable,
+    Watch,
+)
 from daemon.separation.estimator import Components, NotYet, Result
 from daemon.storage.durable import storage
 from daemon.storage.frames import ARRAY, LINES, FrameRecord, FrameStore

@@ -27,7 +27,7 @@ from daemon.exposing.sequencer import Sequencer, exposer_for
 from daemon.exposing.video import Video
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Circle, Method, Unsuitable, Watch
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import response_of
 from drivers.base.camera import CameraSettings
 from drivers.clock import NS, Clock
 from protocol.messages.runs import RunState

@@ -13,7 +13,7 @@ from daemon.devices.rig import Rig
 from daemon.devices.snapshot import snap
 from daemon.manual.manual import Manual
 from daemon.pictures.viewfinder import Viewfinder
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import response_of
 from drivers.base.camera import CameraSettings
 from protocol.patterns import WHITE
 from protocol.scans.spec import Radiometry
