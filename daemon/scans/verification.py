@@ -8,15 +8,15 @@ from collections.abc import Mapping
 from string import ascii_uppercase
 from typing import Any, TypeVar
 
+from daemon.scans.gray_code import bits_for, code, code_patterns
 from daemon.scans.measuring import MeasuringMethod
 from daemon.scans.method import Bench, Digest, Expose, Step, Unsuitable
 from daemon.scans.parameters import leakage_of
 from daemon.scans.planned import exposures, source_references
 from daemon.separation.estimator import Measurement
-from daemon.separation.graycode import Coded
 from daemon.separation.verification import REACH, Anchors, Reading, Source, Spot
 from daemon.separation.verification import Verification as PointReadings
-from protocol.patterns import AnyPattern, Axis, GrayCode
+from protocol.patterns import AnyPattern, Axis
 from protocol.scans.spec import Radiometry
 from protocol.scans.verifications import Verification
 
@@ -31,14 +31,9 @@ class VerificationMethod(MeasuringMethod[V]):
         super().__init__(spec, bench)
         projector = self.projector()
         self._spots = _spots(spec, bench)
-        self._images = [
-            Coded(axis, bit, inverted)
-            for axis, size in (("x", projector.width), ("y", projector.height))
-            for bit in reversed(range(max(1, (size - 1).bit_length())))
-            for inverted in (False, True)
-        ]
-        code = [GrayCode(bit=i.bit, axis=Axis(i.axis), inverted=i.inverted) for i in self._images]
-        self._plan = [*source_references(2 * spec.average), *exposures(code, 1), Digest()]
+        self._images = code({Axis.X: bits_for(projector.width), Axis.Y: bits_for(projector.height)})
+        shown = exposures(code_patterns(self._images), 1)
+        self._plan = [*source_references(2 * spec.average), *shown, Digest()]
 
     @abstractmethod
     def count(self) -> int:
