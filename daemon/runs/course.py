@@ -163,7 +163,7 @@ class Course:
         longest = 1.0
         if isinstance(file.spec, PatternScan) and file.spec.bracket is not None:
             longest = max(file.spec.bracket)
-        self.standing.begins(method, exposure_us * longest * 1e-6)
+        self.standing.begins(method.planned(), exposure_us * longest * 1e-6)
         rig = {**self._rig.snapshot(), "settings": prepared.settings}
         if exposure is not None:
             rig["exposure"] = exposure.facts()
@@ -185,7 +185,7 @@ class Course:
         frames = self._frames(info, resuming)
         try:
             ring = self._ring(choice, bench, method.planned())
-            recorder = self._recorder = self.standing.recorder = Recorder(
+            recorder = self._recorder = self.standing.counts = Recorder(
                 method, frames, ring, self._taken, self._disk_full
             )
             step, sub = self._replay(session, method, recorder, resuming)
