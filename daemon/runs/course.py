@@ -53,7 +53,9 @@ from protocol.scans.occluded import OccluderScan
 from protocol.scans.projected import PatternScan
 
 _RESULT_S = 30.0
-TRUTH_S = 60.0
+"""Deadline of the estimator's result."""
+_TRUTH_S = 60.0
+"""Deadline of a simulated camera's truth, which it computes when it is asked."""
 _SEQUENCE_BYTES = 256 << 20
 """Memory for the frames of hardware-timed sequences, where `ring_frames` are fewer."""
 
@@ -245,7 +247,7 @@ class Course:
     def _truth(self, session: Session, sources: tuple[str, ...]) -> dict[str, Any]:
         """What a simulated camera knows; a scan does not fail for the lack of it."""
         try:
-            return self._rig.camera.call(lambda c: c.truth(sources), TRUTH_S, session)
+            return self._rig.camera.call(lambda c: c.truth(sources), _TRUTH_S, session)
         except DeviceError as error:
             log.warning("no truth to compare with", problem=str(error))
             return {}

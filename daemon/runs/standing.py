@@ -15,10 +15,13 @@ from protocol.errors import Code
 from protocol.messages.runs import Progress, RunState, Waiting
 
 _PROGRESS_S = 0.1
+"""Progress is told no more often."""
 _RATE_FRAMES = 20
-_CONCLUDE_S = 600.0
+"""The rate is that of so many frames, the last ones."""
 _STILL_S = 60.0
 """A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
+_CONCLUDE_S = 600.0
+"""The same while products are written, which gives no sign of life until it is done."""
 
 
 class Counts(Protocol):
