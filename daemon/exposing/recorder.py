@@ -122,6 +122,7 @@ class Recorder:
         self._hurried = False
         self._missing_patterns: dict[int, str] = {}  # and why, last
         self._seen_patterns: set[int] = set()
+        self._why_unused = ""  # of the last frame that was not
         self._incoming: queue.Queue[Exposed | None] = queue.Queue(maxsize=ring.count + 1)
         self._accepted: queue.Queue[tuple[Exposed, FrameRecord] | Future[Result] | None] = (
             queue.Queue(maxsize=ring.count + 8)
@@ -198,6 +199,11 @@ class Recorder:
         """Patterns of which no frame could be had, and why."""
         missing = sorted(self._missing_patterns.items())
         return {pattern: why for pattern, why in missing if pattern not in self._seen_patterns}
+
+    @property
+    def why_unused(self) -> str:
+        """Why the last of the frames that were rejected was; "": none was."""
+        return self._why_unused
 
     @property
     def exposing(self) -> Mapping[str, int]:
@@ -393,6 +399,8 @@ class Recorder:
     def _note(self, record: FrameRecord) -> None:
         if record.observation.used:
             self._seen_patterns.add(record.observation.pattern)
+        else:
+            self._why_unused = record.observation.reason
 
     def _conclude(self) -> Result:
         result = self._estimator.result()
