@@ -12,6 +12,7 @@ frames before it are decoded and dropped: a seek by time would not be exact.
 from __future__ import annotations
 
 import fnmatch
+import os
 import re
 import threading
 from collections import Counter
@@ -260,7 +261,7 @@ class ReplayCamera(Camera):
     # ------------------------------------------------------------ finding the files
 
     def _listing(self, folder: Path, first: tuple[Path, ...]) -> tuple[Path, ...]:
-        apart = {path.resolve() for path in first}
+        apart = {os.path.realpath(path) for path in first}
         try:
             entries = sorted(folder.iterdir(), key=lambda path: natural_key(path.name))
         except OSError as error:
@@ -273,7 +274,7 @@ class ReplayCamera(Camera):
             for path in seen
             if not path.is_dir()
             and fnmatch.fnmatchcase(path.name, self.options.match)
-            and path.resolve() not in apart
+            and os.path.realpath(path) not in apart  # not resolve(): it fails for a loop of links
         )
         if not files:
             folders = ", ".join(path.name for path in seen if path.is_dir())
@@ -355,11 +356,12 @@ class ReplayCamera(Camera):
             return self._read_image(path, "grab"), path.name
         if recording.video is None:
             return None, ""
-        if self._video is None:
-            self._video = self._at(recording.video, "grab", VideoFile)
-            self._video.skip(index - len(recording.images))
-        number = self._video.next
-        image = self._video.read()
+        video = self._video
+        if video is None:
+            video = self._video = self._at(recording.video, "grab", VideoFile)
+            video.skip(index - len(recording.images))
+        number = video.next
+        image = self._at(recording.video, "grab", lambda _: video.read())
         if image is None:
             return None, ""
         return self._fit(image, recording.video, "grab"), f"{recording.video.name}#{number}"

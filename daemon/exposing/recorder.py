@@ -28,6 +28,7 @@ from typing import Any, TypeVar
 import structlog
 
 from daemon.exposing.ring import Buffer, Ring
+from daemon.exposing.unusable import UNFORESEEN, named
 from daemon.scans.method import Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, NotYet, Result
 from daemon.storage.durable import StorageError
@@ -154,8 +155,9 @@ class Recorder:
                 self._missing_patterns[record.observation.pattern] = record.missing
                 continue
             scratch = self._frames.read(record.index, out=scratch)
-            self._method.recall(scratch, record.observation)
-            self._estimator.update(scratch, record.observation)
+            with named(record.index, record.source):
+                self._method.recall(scratch, record.observation)
+                self._estimator.update(scratch, record.observation)
             self._note(record)
             recorded += 1
             rejected += not record.observation.used
@@ -305,18 +307,17 @@ class Recorder:
     def _accept(self, exposed: Exposed) -> FrameRecord:
         frame = exposed.frame
         step = exposed.step
-        observation = self._method.observe(
-            step,
-            Taken(
-                step=exposed.index,
-                sub=exposed.sub,
-                incomplete=frame is None or frame.incomplete,
-                source=frame.source if frame else "",
-                pixels=frame.pixels if frame else None,
-                delay_us=(frame.start_ns - exposed.lit_ns) / 1e3 if frame and exposed.lit_ns else 0,
-                exposure_us=frame.exposure_us if frame else 0.0,
-            ),
+        taken = Taken(
+            step=exposed.index,
+            sub=exposed.sub,
+            incomplete=frame is None or frame.incomplete,
+            source=frame.source if frame else "",
+            pixels=frame.pixels if frame else None,
+            delay_us=(frame.start_ns - exposed.lit_ns) / 1e3 if frame and exposed.lit_ns else 0,
+            exposure_us=frame.exposure_us if frame else 0.0,
         )
+        with named(len(self._frames), taken.source):
+            observation = self._method.observe(step, taken)
         record = FrameRecord(
             index=len(self._frames),
             step=exposed.index,
@@ -380,7 +381,8 @@ class Recorder:
                 self._tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
             else:
                 if not self._hurried:
-                    self._estimator.update(exposed.frame.pixels, record.observation)
+                    with named(record.index, record.source):
+                        self._estimator.update(exposed.frame.pixels, record.observation)
                 self._note(record)
                 self._tally = Tally(
                     tally.recorded + 1,
@@ -409,5 +411,5 @@ class Recorder:
     def _answer(self, future: Future[Result]) -> None:
         try:
             future.set_result(self._conclude())
-        except (NotYet, ValueError, ArithmeticError) as error:
+        except (NotYet, *UNFORESEEN) as error:  # told to who asks; the scan goes on
             future.set_exception(error)

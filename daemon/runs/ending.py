@@ -66,9 +66,7 @@ def without_result(error: NotYet, recorder: Recorder, reason: str) -> UmbraError
     if tally.rejected:
         frames += f"; {tally.rejected} were not used, the last for: {recorder.why_unused}"
     return UmbraError(
-        Code.NO_RESULT,
-        f"nothing can be separated: {error}. It ended for: {reason}. {frames}. "
-        "`umbra resume` goes on from there",
+        Code.NO_RESULT, f"there is no result: {error}. It ended for: {reason}. {frames}"
     )
 
 
