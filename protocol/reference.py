@@ -22,7 +22,7 @@ from protocol.errors import Code, ErrorInfo
 from protocol.following import SILENCE_S
 from protocol.messages import commands, replies
 from protocol.messages.access import DEFAULT_COMMAND, DEFAULT_EVENTS, Role
-from protocol.messages.envelopes import PROTOCOL, ArrayHeader, Event, Request, Response
+from protocol.messages.envelopes import JOINED, PROTOCOL, ArrayHeader, Event, Request, Response
 from protocol.messages.events import AnyEvent
 from protocol.messages.findings import Check, Found, Outcome, Search
 from protocol.messages.rig import CameraSettings, DeviceInfo, Health, LockInfo, RigState, StageState
@@ -328,7 +328,7 @@ it: [thirty lines](#thirty-lines) are enough for a scan.
 | endpoint | default | daemon | client |
 | --- | --- | --- | --- |
 | command | `{DEFAULT_COMMAND}` | ROUTER | DEALER, never REQ |
-| events | `{DEFAULT_EVENTS}` | PUB | SUB, by [topic](#events) |
+| events | `{DEFAULT_EVENTS}` | XPUB | SUB, by [topic](#events) |
 
 `ipc://` works for both. The events endpoint is in the answer to `hello`; where its host is `*` or
 `0.0.0.0`, it is the host that was reached. Off loopback both are CURVE sockets: see [keys](#keys).
@@ -370,7 +370,9 @@ delimiter frame. Unknown fields and values out of range are refused with the pat
 ## Events in practice
 
 Each topic counts its events from 1, anew in each `epoch` (a start of the daemon). Subscribe, then
-ask for `status`: its `sequences` say which events it already holds. A number that is not the next,
+ask for `status`: its `sequences` say which events it already holds. A subscription takes a moment
+to arrive: subscribe last to a topic of your own that begins with `{JOINED}`, and an event of that
+name, one frame without a header, tells that the rig knows them all. A number that is not the next,
 or another epoch, means that something was missed: ask again. A subscriber that is slow loses
 events and never slows the rig. Umbra's own clients let {EVENTS_HWM} events wait, and on a socket of
 their own {PREVIEWS_HWM} previews; they ask when they have heard nothing for {SILENCE_S:g} s.

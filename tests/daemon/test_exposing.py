@@ -26,7 +26,7 @@ from daemon.exposing.ring import Ring
 from daemon.exposing.sequencer import Sequencer, exposer_for
 from daemon.exposing.video import Video
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Circle, Method, Unsuitable, Watch
+from daemon.scans.method import Circle, Expose, Method, Unsuitable, Watch
 from daemon.scans.pattern_scan import response_of
 from drivers.base.camera import CameraSettings
 from drivers.clock import NS, Clock
@@ -239,6 +239,36 @@ def test_a_sequence_that_loses_frames_is_run_again_more_slowly(
     run(stand, Mode.HARDWARE)
     assert [p / periods[0] for p in periods] == pytest.approx([1, 2, 4])
     assert all(e.frame is not None for e in stand.tape.taken)
+
+
+class Doubter:
+    """In the place of the proof by looks: doubts the frames of these calls."""
+
+    def __init__(self, calls: set[int]) -> None:
+        self.calls, self.asked = calls, list[int]()
+
+    def problem(self, _: Any, step: Expose, __: Any) -> str:
+        self.asked.append(step.index)
+        return "it looks odd" if len(self.asked) in self.calls else ""
+
+
+@pytest.mark.parametrize(
+    ("doubted", "lost"), [({1, 5, 6, 12}, set()), ({2, 3, 4}, {1}), ({12, 13, 14}, {11})]
+)
+def test_a_frame_that_looks_wrong_is_exposed_again_and_so_is_the_next(
+    stand: Stand, doubted: set[int], lost: set[int]
+) -> None:
+    doubter = Doubter(doubted)
+    stand.apparatus.looks = cast(Any, doubter)
+    run(stand, Mode.SOFTWARE)
+    taken = stand.tape.taken
+    assert [(e.index, e.sub) for e in taken] == [(i, s) for i in range(4) for s in range(3)]
+    assert {i for i, e in enumerate(taken) if e.frame is None} == lost
+    assert sum(e.exposing.get("repeated", 0) for e in taken) == len(doubted) - len(lost)
+    assert doubter.asked == sorted(doubter.asked)  # no frame of a later pattern passed for one
+    assert len({e.frame.start_ns for e in taken if e.frame is not None}) == 12 - len(lost)
+    ring = stand.apparatus.ring
+    assert all(ring.take(0) is not None for _ in range(ring.count))  # no buffer is lost
 
 
 @pytest.mark.parametrize("stand", [{"camera": 'faults = ["incomplete-frame@1"]'}], indirect=True)
