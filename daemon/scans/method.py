@@ -177,6 +177,10 @@ class Method(ABC, Generic[S]):
         del summary, seconds
         return ""
 
+    def short(self) -> bool:
+        """Whether the video ended with too few frames for its reason to be one of the scene's."""
+        return False
+
     def conclude(self, components: Components) -> Components:
         """The last word on the components before they are kept (masks that need the whole)."""
         return components
