@@ -204,7 +204,9 @@ class Rig:
             return
         if isinstance(error, DeviceLost) or member.thread.stuck:
             member.stale = member.pending
-            self._set(member, Health.STUCK if member.thread.stuck else Health.LOST, str(error))
+            known = member.health is Health.LOST  # the first error was the cause
+            message = member.message if known else str(error)
+            self._set(member, Health.STUCK if member.thread.stuck else Health.LOST, message)
 
     @contextlib.contextmanager
     def noticing(self) -> Iterator[None]:
