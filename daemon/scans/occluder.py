@@ -35,26 +35,28 @@ from protocol.scans.spec import Reference
 O = TypeVar("O", bound=OccluderScan)  # noqa: E741
 
 MOST_CHANGE = 0.15
-"""Beyond this a change of the source is a cloud: below it, a scale."""
+"""A source that changed by a larger part is behind a cloud, and its frames are not used; after a
+smaller change they are scaled."""
 
 LEAST_CHANGE = 0.005
-"""Within this the source has not changed."""
+"""After a smaller change frames are used as they are."""
 
 LASTING = 50
-"""A source that is brighter than the reference for so many frames in a row is the reference."""
+"""After so many frames in a row that are brighter than the reference, these become the reference:
+the scan began under a cloud."""
 
 VAIN_TURNS = 5
-"""Turns of the circle that cover no more: then it never will."""
+"""After so many turns of the circle without more coverage the scan ends."""
 
 GROWTH = 0.0005
-"""Coverage grows by as much, or noise moves it."""
+"""A smaller rise of the coverage may be noise."""
 
 MANY_LOST = 0.1
-"""A part of the frames, lost, that is to be told with the coverage that they would have brought."""
+"""Where a larger part of the frames was lost, that is the reason given for missing coverage."""
 
 MOST_WANDERED = 0.3
-"""Pixels by which the camera may have moved while its place was learned: beyond it a live
-collection begins anew."""
+"""Pixels that the camera may move while its place is learned; if it moved further, a live scan
+begins to collect anew."""
 
 LOST = "lost frame"
 CLOUD = "cloud"
@@ -318,7 +320,8 @@ class OccluderMethod(Method[O]):
 
 
 class _InVain:
-    """Counts turns of a circle that brought no coverage; frames that were not used don't count."""
+    """Counts the turns of a circle since coverage last grew; time in which no frame was used does
+    not count."""
 
     def __init__(self) -> None:
         self._most = 0.0
