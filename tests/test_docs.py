@@ -26,7 +26,7 @@ GENERATED = {"protocol.md"}  # has a test of its own
 DECISIONS = REPOSITORY / "docs/decisions"
 
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-_LINK = re.compile(r"(?<!!)\[[^\]]+\]\(([^)\s]+)\)")
+_LINK = re.compile(r"\[[^\]]+\]\(([^)\s]+)\)")  # of pictures too
 
 
 def name(page: Path) -> str:
