@@ -41,7 +41,7 @@ R = TypeVar("R")
 _GROUP_FRAMES = 16
 _GROUP_S = 0.25
 """A commit comes at the latest after so many frames or seconds; sooner when nothing waits."""
-_PATIENCE_S = 0.25
+_PATIENCE_S = 0.25  # how often a full queue is tried again, and the other worker looked at
 
 log = structlog.get_logger(__name__)
 

@@ -35,7 +35,7 @@ _MENDS = {
     Code.STORAGE_FULL,
     Code.NOT_READY,
 }
-_STEADY_LOOKS = 3
+_STEADY_LOOKS = 3  # that must agree for light to be steady
 
 log = structlog.get_logger(__name__)
 

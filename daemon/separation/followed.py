@@ -30,8 +30,8 @@ _LEAST = 32  # of them, to say anything
 _DIM = 0.2  # of the brightest pixels' step: with less, a pixel is not looked at
 _SURPLUS = 3.5  # times the variance expected from which a matrix holds more than noise
 _FLOOR = 0.03  # of a matrix's mean variance, the least that a sample of it has
-_ROUNDS = 4
-_LEVELS = 65
+_ROUNDS = 4  # of fitting, each without the matrices that the last found too noisy
+_LEVELS = 65  # that the noise is given at
 
 
 class Followed:

@@ -31,7 +31,7 @@ LEAST = 4
 """Patterns of which something is known of order: with fewer, there is one sample at an end."""
 
 _SOME = 8192  # pixels that a typical one is found among
-_GROUPS = 8
+_GROUPS = 8  # of pixels, by their light
 _LEAST = 32  # pixels that make a group
 _DIM = 0.2  # of the brightest pixels' step: with less, a pixel is not looked at
 _WITHIN = 1.5  # times the distance of the kept ranks from an end of the scale, to be clear of it

@@ -44,7 +44,7 @@ Warp = tuple[float, float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 
 _WORK = 320  # longer side of the pictures that are compared
-_LEAST_SIDE = 200
+_LEAST_SIDE = 200  # small pixels of the longer side
 _FLOOR = 0.03  # of the bright places: added to light, so that the dark ones' noise has no say
 _FOLLOWED = 0.25  # of the differences: only a mesh that was taken for the scene explains so much
 _TAPER = 0.08  # part of the picture at each edge that fades out
