@@ -7,6 +7,7 @@ first, and must all be alike.
 from __future__ import annotations
 
 import fnmatch
+import os
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -74,7 +75,7 @@ def natural_key(name: str) -> tuple[tuple[str | int, ...], str]:
 
 def _listing(folder: Path, apart: tuple[Path, ...], match: str) -> tuple[Path, ...]:
     """The folder's images, without those that are given `apart`."""
-    known = {path.resolve() for path in apart}
+    known = {os.path.realpath(path) for path in apart}
     try:
         entries = sorted(folder.iterdir(), key=lambda path: natural_key(path.name))
     except OSError as error:
@@ -87,7 +88,7 @@ def _listing(folder: Path, apart: tuple[Path, ...], match: str) -> tuple[Path, .
         for path in seen
         if not path.is_dir()
         and fnmatch.fnmatchcase(path.name, match)
-        and path.resolve() not in known
+        and os.path.realpath(path) not in known  # not resolve(): it fails for a loop of links
     )
     if not files:
         folders = ", ".join(path.name for path in seen if path.is_dir())

@@ -285,11 +285,12 @@ class ReplayCamera(Camera):
             return self._read_image(path, "grab"), path.name
         if recording.video is None:
             return None, ""
-        if self._video is None:
-            self._video = self._at(recording.video, "grab", VideoFile)
-            self._video.skip(index - len(recording.images))
-        number = self._video.next
-        image = self._video.read()
+        video = self._video
+        if video is None:
+            video = self._video = self._at(recording.video, "grab", VideoFile)
+            video.skip(index - len(recording.images))
+        number = video.next
+        image = self._at(recording.video, "grab", lambda _: video.read())
         if image is None:
             return None, ""
         return self._fit(image, recording.video, "grab"), f"{recording.video.name}#{number}"

@@ -28,6 +28,7 @@ from typing import Any, TypeVar
 import structlog
 
 from daemon.exposing.ring import Buffer, Ring
+from daemon.exposing.unusable import UNFORESEEN, named
 from daemon.scans.method import Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, NotYet, Result
 from daemon.storage.durable import StorageError
@@ -122,6 +123,7 @@ class Recorder:
         self._hurried = False
         self._missing_patterns: dict[int, str] = {}  # and why, last
         self._seen_patterns: set[int] = set()
+        self._why_unused = ""  # of the last frame that was not
         self._incoming: queue.Queue[Exposed | None] = queue.Queue(maxsize=ring.count + 1)
         self._accepted: queue.Queue[tuple[Exposed, FrameRecord] | Future[Result] | None] = (
             queue.Queue(maxsize=ring.count + 8)
@@ -153,8 +155,9 @@ class Recorder:
                 self._missing_patterns[record.observation.pattern] = record.missing
                 continue
             scratch = self._frames.read(record.index, out=scratch)
-            self._method.recall(scratch, record.observation)
-            self._estimator.update(scratch, record.observation)
+            with named(record.index, record.source):
+                self._method.recall(scratch, record.observation)
+                self._estimator.update(scratch, record.observation)
             self._note(record)
             recorded += 1
             rejected += not record.observation.used
@@ -198,6 +201,11 @@ class Recorder:
         """Patterns of which no frame could be had, and why."""
         missing = sorted(self._missing_patterns.items())
         return {pattern: why for pattern, why in missing if pattern not in self._seen_patterns}
+
+    @property
+    def why_unused(self) -> str:
+        """Why the last of the frames that were rejected was; "": none was."""
+        return self._why_unused
 
     @property
     def exposing(self) -> Mapping[str, int]:
@@ -299,18 +307,17 @@ class Recorder:
     def _accept(self, exposed: Exposed) -> FrameRecord:
         frame = exposed.frame
         step = exposed.step
-        observation = self._method.observe(
-            step,
-            Taken(
-                step=exposed.index,
-                sub=exposed.sub,
-                incomplete=frame is None or frame.incomplete,
-                source=frame.source if frame else "",
-                pixels=frame.pixels if frame else None,
-                delay_us=(frame.start_ns - exposed.lit_ns) / 1e3 if frame and exposed.lit_ns else 0,
-                exposure_us=frame.exposure_us if frame else 0.0,
-            ),
+        taken = Taken(
+            step=exposed.index,
+            sub=exposed.sub,
+            incomplete=frame is None or frame.incomplete,
+            source=frame.source if frame else "",
+            pixels=frame.pixels if frame else None,
+            delay_us=(frame.start_ns - exposed.lit_ns) / 1e3 if frame and exposed.lit_ns else 0,
+            exposure_us=frame.exposure_us if frame else 0.0,
         )
+        with named(len(self._frames), taken.source):
+            observation = self._method.observe(step, taken)
         record = FrameRecord(
             index=len(self._frames),
             step=exposed.index,
@@ -374,7 +381,8 @@ class Recorder:
                 self._tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
             else:
                 if not self._hurried:
-                    self._estimator.update(exposed.frame.pixels, record.observation)
+                    with named(record.index, record.source):
+                        self._estimator.update(exposed.frame.pixels, record.observation)
                 self._note(record)
                 self._tally = Tally(
                     tally.recorded + 1,
@@ -393,6 +401,8 @@ class Recorder:
     def _note(self, record: FrameRecord) -> None:
         if record.observation.used:
             self._seen_patterns.add(record.observation.pattern)
+        else:
+            self._why_unused = record.observation.reason
 
     def _conclude(self) -> Result:
         result = self._estimator.result()
@@ -401,5 +411,5 @@ class Recorder:
     def _answer(self, future: Future[Result]) -> None:
         try:
             future.set_result(self._conclude())
-        except (NotYet, ValueError, ArithmeticError) as error:
+        except (NotYet, *UNFORESEEN) as error:  # told to who asks; the scan goes on
             future.set_exception(error)

@@ -196,6 +196,22 @@ class ManualStage:
                 Code.BUSY, "the stage is homing: wait for its end, or `umbra stage stop`"
             )
 
+    def _require_homed(self) -> None:
+        """What a stage would refuse in any case, as a state of the rig's that homing mends."""
+        now = self.status()
+        name = self._thread.device.name
+        if now.state is StageState.ALARM:
+            raise UmbraError(
+                Code.WRONG_STATE,
+                f"{name}: it is in alarm"
+                + (f": {now.detail}" if now.detail else "")
+                + "; look at it, then `umbra stage home`",
+            )
+        if now.position_mm is None:
+            raise UmbraError(
+                Code.WRONG_STATE, f"{name}: its position is not known; home it: `umbra stage home`"
+            )
+
     def _take_over(self) -> None:
         """Follow the motion under way no more: its pumping would wait behind what comes now, and
         a call that is late halts the stage."""
@@ -214,6 +230,7 @@ class ManualStage:
         with self._mutex:
             self._require_not_homing()
             session = self._use(_LEASE_S)
+            self._require_homed()
             self._take_over()
 
             def go(stage: Stage) -> None:

@@ -31,7 +31,7 @@ from daemon.exposing.ring import Ring
 from daemon.exposing.sequencer import Sequencer, exposer_for
 from daemon.pictures.viewfinder import Viewfinder
 from daemon.products import separated
-from daemon.runs.ending import close, end_of, of_lost, requeue, utc_now, with_exposure
+from daemon.runs.ending import close, end_of, requeue, utc_now, with_exposure, without_result
 from daemon.runs.failures import as_error
 from daemon.runs.preparation import Preparation
 from daemon.runs.resuming import require_same_sun
@@ -208,7 +208,7 @@ class Course:
             self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
             truth = self._truth(session, _sources(file.spec, bench))
             self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
-            return self._conclude(recorder, info, truth)
+            return self._conclude(recorder, method, info, truth)
         finally:
             frames.close()
 
@@ -360,17 +360,17 @@ class Course:
 
     # ------------------------------------------------------------ after
 
-    def _conclude(self, recorder: Recorder, info: CameraInfo, truth: Mapping[str, Any]) -> End:
+    def _conclude(
+        self, recorder: Recorder, method: Method[Any], info: CameraInfo, truth: Mapping[str, Any]
+    ) -> End:
         self.standing.update(state=RunState.FINISHING)
         self.standing.say("writing products")
         began = time.monotonic()
         lost = recorder.lost_patterns
         try:
             result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
-        except NotYet:
-            if lost:
-                raise UmbraError(Code.FRAMES_MISSING, f"{of_lost(lost)}: scan again") from None
-            raise
+        except NotYet as error:
+            raise without_result(error, recorder, self._reason) from None
         self._timings["separate_s"] = time.monotonic() - began
         made = separated.write(
             self.folder,
@@ -383,7 +383,7 @@ class Course:
         )
         self.folder.add_products(made)
         self._timings["products_s"] = time.monotonic() - began
-        return end_of(lost, self._reason)
+        return end_of(lost, self._reason, short=method.short())
 
 
 def _sources(spec: AnyScan, bench: Bench) -> tuple[str, ...]:

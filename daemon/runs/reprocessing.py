@@ -22,6 +22,7 @@ import structlog
 
 from daemon.exposing.control import Control
 from daemon.exposing.recorder import Tally
+from daemon.exposing.unusable import named
 from daemon.products import separated
 from daemon.runs.ending import close, end_of, utc_now, with_exposure
 from daemon.runs.failures import as_error
@@ -188,13 +189,14 @@ class Reprocessing:
                 self.standing.taken(self.tally)
                 continue
             scratch = frames.read(record.index, out=scratch)
-            if again:
-                observation = method.observe(step, _taken(record, scratch))
-            else:
-                observation = record.observation
-                method.recall(scratch, observation)
+            with named(record.index, record.source):
+                if again:
+                    observation = method.observe(step, _taken(record, scratch))
+                else:
+                    observation = record.observation
+                    method.recall(scratch, observation)
             own.append(scratch, msgspec.structs.replace(record, observation=observation))
-            with self._estimating:
+            with self._estimating, named(record.index, record.source):
                 estimator.update(scratch, observation)
                 self.summary = estimator.summary()
             self._conclude = conclude

@@ -179,6 +179,10 @@ class Method(ABC, Generic[S]):
         del summary, seconds
         return ""
 
+    def short(self) -> bool:
+        """Whether the video ended with too few frames for its reason to be one of the scene's."""
+        return False
+
     def conclude(self, components: Components) -> Components:
         """Complete the components with what only the method knows, before they are kept."""
         return components

@@ -21,7 +21,7 @@ from daemon.separation.estimator import Estimator, Lighting, Observation
 from daemon.separation.exposure_noise import ROUNDING, Sensor
 from daemon.separation.extremes import Extremes
 from daemon.separation.frameset import FrameSet, Watched
-from daemon.separation.order_estimate import KEEP, LEAST, RANKS
+from daemon.separation.order_estimate import KEEP, LEAST, LEAST_FOR_BLUR
 from daemon.separation.radiometry import Response
 from protocol.patterns import AnyPattern
 from protocol.scans.projected import PatternScan
@@ -267,7 +267,7 @@ class RankedMethod(PatternMethod[P]):
                 "$.estimator",
             )
         ranked = not (few or name.startswith("maxmin"))
-        known = len(self._patterns) >= 2 * RANKS
+        known = len(self._patterns) >= LEAST_FOR_BLUR
         ordered = len(self._patterns) >= LEAST
         if name == "maxmin-unbiased" and not ordered:
             raise Unsuitable(

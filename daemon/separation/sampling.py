@@ -28,6 +28,17 @@ def thinned(plane: NDArray[Any], most: int = 8192) -> NDArray[Any]:
     return flat[::step]
 
 
+def gathered(values: NDArray[Any]) -> float:
+    """Where most of a population lies, though the rest is all to one side: the median of the
+    shortest interval that holds half of it (the shorth's)."""
+    ordered = np.sort(thinned(values))
+    half = ordered.size // 2
+    if half < 2:
+        return float(np.median(ordered))
+    first = int(np.argmin(ordered[half:] - ordered[: ordered.size - half]))
+    return float(np.median(ordered[first : first + half + 1]))
+
+
 class Moments:
     """Mean and variance of frames at each sample: two planes, whatever their number."""
 

@@ -57,7 +57,8 @@ def _status_lines(now: Status, server: str) -> list[tuple[str, str]]:
     ]
     for device in now.devices:
         model = " ".join(part for part in (device.model or device.driver, device.message) if part)
-        lines.append((device.name, f"{device.health.value} · {model}"))
+        homed = ", not homed" if device.facts.get("homed") is False else ""
+        lines.append((device.name, f"{device.health.value}{homed} · {model}"))
     if now.run is not None:
         told = f"{now.run.state.value} · {now.run.id}: {method(now.run)}, {frames(now.run)}"
         if now.progress is not None and now.progress.rate_hz:
