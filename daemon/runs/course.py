@@ -33,7 +33,7 @@ from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.control import Control
 from daemon.exposing.exposer import Behind
 from daemon.exposing.modes import Choice, Mode, choose
-from daemon.exposing.recorder import Exposed, Recorder, Tally
+from daemon.exposing.recorder import Exposed, Recorder
 from daemon.exposing.ring import Ring
 from daemon.exposing.sequencer import Sequencer, exposer_for
 from daemon.pictures.viewfinder import Viewfinder
@@ -48,6 +48,7 @@ from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet, Result
 from daemon.storage.durable import StorageError
 from daemon.storage.frames import FrameStore
+from daemon.storage.ledger import Tally
 from daemon.storage.runfolder import RunFolder
 from daemon.storage.store import Store
 from drivers.base.camera import CameraInfo
@@ -386,7 +387,7 @@ class Course:
             recorded=tally.recorded,
             missing=tally.missing,
             rejected=tally.rejected,
-            sequencing=choice.facts(recorder.exposing),
+            sequencing=choice.facts(recorder.ledger.exposing),
         )
 
     # ------------------------------------------------------------ after
@@ -397,11 +398,11 @@ class Course:
         self.standing.update(state=RunState.FINISHING)
         self.standing.say("writing products")
         began = time.monotonic()
-        lost = recorder.lost_patterns
+        lost = recorder.ledger.lost_patterns
         try:
             result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
         except NotYet as error:
-            raise without_result(error, recorder, self._reason) from None
+            raise without_result(error, recorder.ledger, self._reason) from None
         self._timings["separate_s"] = time.monotonic() - began
         made = separated.write(
             self.folder,

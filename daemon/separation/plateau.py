@@ -40,7 +40,7 @@ ALONE = 1.5
 Part = tuple[slice, slice]
 WHOLE: Part = (slice(None), slice(None))
 
-_KEPT = 2
+_KEPT = 2  # samples of each end that are kept in order: a level begins with them
 _COUNTED = 256  # samples from which on the second most extreme of them is taken for as far off
 _MOST = 65_535  # samples that are counted, and averaged
 _CHUNK = 1 << 15  # samples that are worked on at a time, so that they stay in the cache

@@ -65,16 +65,16 @@ class Split:
     deviation: Plane
     known: Mask
 
-    def stated(
+    def noise(
         self, direct_std: Plane, global_std: Plane, total: Plane, total_std: Plane
     ) -> tuple[Plane, Plane]:
-        """Deviations of both components: at edges those of parts of the total, elsewhere as given;
-        and how much neighbours differ."""
+        """Deviations of both components by noise: at edges those of parts of the total, elsewhere
+        as given."""
         part: Plane = np.clip(self.direct / np.maximum(total, np.float32(1e-3)), 0.0, 1.0)
         known = _as(self.known, part)
         of_direct: Plane = np.where(known, part * total_std, direct_std)
         of_global: Plane = np.where(known, (np.float32(1.0) - part) * total_std, global_std)
-        return np.hypot(of_direct, self.deviation), np.hypot(of_global, self.deviation)
+        return of_direct, of_global
 
 
 def as_neighbours(direct: Plane, total: Plane, noise: Plane, edge: Mask, *, mosaic: bool) -> Split:
