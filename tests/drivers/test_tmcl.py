@@ -20,11 +20,11 @@ from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRe
 from drivers.base.stage import StageState, StageStatus
 from drivers.tmcl import TmclOptions, TmclStage
 from drivers.tmcl_protocol import checksum, encode, find_answer
+from tests.drivers.moment import once
 from tests.drivers.tmcl_peer import TmclPeer
 
-pytestmark = pytest.mark.timeout(20)
-
 R = 3.0
+SEARCH = (13, 0, 0)  # as the peer hears it
 TURN = 200 << 8
 FEED = 45.0
 
@@ -120,11 +120,8 @@ def test_a_reference_that_is_not_found_ends_at_the_deadline(
 
 def test_halt_ends_homing(peer: TmclPeer, stage: TmclStage) -> None:
     peer.faults.no_reference = True
-    timer = threading.Timer(0.2, stage.halt)
-    timer.start()
-    with pytest.raises(DeviceError, match="halt"):
+    with once(lambda: SEARCH in peer.frames, stage.halt), pytest.raises(DeviceError, match="halt"):
         stage.home(100.0)
-    timer.join()
     assert stage.status().state is StageState.UNKNOWN
     assert (13, 1, 0) in peer.frames
 
@@ -287,11 +284,8 @@ def test_what_a_halt_left_on_the_line_does_not_end_the_next_homing(
     peer: TmclPeer, stage: TmclStage
 ) -> None:
     peer.faults.no_reference = True
-    timer = threading.Timer(0.2, stage.halt)
-    timer.start()
-    with pytest.raises(DeviceError, match="halt"):
+    with once(lambda: SEARCH in peer.frames, stage.halt), pytest.raises(DeviceError, match="halt"):
         stage.home(100.0)
-    timer.join()
     peer.faults.late = [0.1, 0.1]
     stage.halt()
     with pytest.raises(DeviceTimeout, match="reference was not found"):

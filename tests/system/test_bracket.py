@@ -26,7 +26,7 @@ from tests.system.harness import FAST, Daemon, recorded, until
 from tests.system.test_command_line import SIZE, checker
 from tests.system.test_command_line import umbra as run_umbra
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.system
 
 LONG_US = 45_000.0  # two thirds of the virtual scene are saturated
 BRACKET = (0.25, 1.0, 4.0)
