@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +103,9 @@ def test_the_installed_example_is_accepted() -> None:
 def commands(page: Path) -> Iterator[list[str]]:
     """The `umbra` command lines in the shell examples of a page, as words."""
     for text in fences(page, "sh"):
-        for line in text.splitlines():
+        for line in text.replace("\\\n", "").splitlines():
             words = shlex.split(line, comments=True)
+            words = list(takewhile(lambda word: word not in {"|", "||", "&&", "&"}, words))
             if words[:1] == ["sudo"]:
                 words = words[1:]
             if words and Path(words[0]).name == "umbra":

@@ -14,7 +14,6 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from datetime import datetime
 from typing import Any
 
 import structlog
@@ -35,6 +34,7 @@ from daemon.products import separated
 from daemon.runs.ending import close, end_of, requeue, utc_now, with_exposure, without_result
 from daemon.runs.failures import as_error
 from daemon.runs.preparation import Preparation
+from daemon.runs.resuming import require_same_sun
 from daemon.runs.room import Room
 from daemon.runs.standing import Standing
 from daemon.scans.method import Bench, Method
@@ -53,8 +53,9 @@ from protocol.scans.occluded import OccluderScan
 from protocol.scans.projected import PatternScan
 
 _RESULT_S = 30.0
-TRUTH_S = 60.0
-SUN_DEG_PER_HOUR = 15.0
+"""Deadline of the estimator's result."""
+_TRUTH_S = 60.0
+"""Deadline of a simulated camera's truth, which it computes when it is asked."""
 _SEQUENCE_BYTES = 256 << 20
 """Memory for the frames of hardware-timed sequences, where `ring_frames` are fewer."""
 
@@ -86,7 +87,6 @@ class Course:
         self._room = Room(store, self.control)
         self._timings: dict[str, float] = {}
         self._reason = ""  # why the steps ended
-        self._broke_off = ""  # when an interrupted run took its last frame
 
     # ------------------------------------------------------------ for others
 
@@ -153,7 +153,6 @@ class Course:
         began = time.monotonic()
         file = self.folder.file
         resuming = bool(file.started)
-        self._broke_off = self._last_frame() if resuming else ""
         prepared = preparation.prepare(session, resuming=resuming)
         method = prepared.method
         bench, exposure = prepared.bench, prepared.exposure
@@ -163,7 +162,7 @@ class Course:
         longest = 1.0
         if isinstance(file.spec, PatternScan) and file.spec.bracket is not None:
             longest = max(file.spec.bracket)
-        self.standing.begins(method, exposure_us * longest * 1e-6)
+        self.standing.begins(method.planned(), exposure_us * longest * 1e-6)
         rig = {**self._rig.snapshot(), "settings": prepared.settings}
         if exposure is not None:
             rig["exposure"] = exposure.facts()
@@ -185,16 +184,16 @@ class Course:
         frames = self._frames(info, resuming)
         try:
             ring = self._ring(choice, bench, method.planned())
-            recorder = self._recorder = self.standing.recorder = Recorder(
+            recorder = self._recorder = self.standing.counts = Recorder(
                 method, frames, ring, self._taken, self._disk_full
             )
-            step, sub = self._replay(session, method, recorder, resuming)
+            start = self._replay(session, method, recorder, frames, resuming=resuming)
             recorder.start()
             self.standing.say("scanning")
             self._timings["prepare_s"] = time.monotonic() - began
             scanning = self._rig.clock.now_ns()
             try:
-                self._sequence(session, method, recorder, ring, choice, (step, sub))
+                self._sequence(session, method, recorder, ring, choice, start)
             except BaseException:
                 # Now, for the recorder may wait long for room.
                 self._rig.make_safe(halt=not session.ended.is_set())
@@ -248,7 +247,7 @@ class Course:
     def _truth(self, session: Session, sources: tuple[str, ...]) -> dict[str, Any]:
         """What a simulated camera knows; a scan does not fail for the lack of it."""
         try:
-            return self._rig.camera.call(lambda c: c.truth(sources), TRUTH_S, session)
+            return self._rig.camera.call(lambda c: c.truth(sources), _TRUTH_S, session)
         except DeviceError as error:
             log.warning("no truth to compare with", problem=str(error))
             return {}
@@ -290,42 +289,25 @@ class Course:
         self.control.check(session)
 
     def _replay(
-        self, session: Session, method: Method[Any], recorder: Recorder, resuming: bool
+        self,
+        session: Session,
+        method: Method[Any],
+        recorder: Recorder,
+        frames: FrameStore,
+        *,
+        resuming: bool,
     ) -> tuple[int, int]:
+        """Take in what was recorded before an interruption; the step and sub-index to begin with.
+        Raises UmbraError(unsuitable) where the sun has moved on."""
         with closing(frames_ahead(self._rig.camera, session, self.standing.live)) as ahead:
             method.foresee(ahead)
         if not resuming:
             return 0, 0
         self.standing.say("taking in what was recorded before the interruption")
-        self._same_sun()
+        require_same_sun(self.folder, frames.records(), self._rig.clock.utc_ns())
         step, sub = recorder.replay(lambda: self._replayed(session))
         log.info("resumed", step=step, sub=sub, recorded=recorder.tally.recorded)
         return step, sub
-
-    def _last_frame(self) -> str:
-        """When the last frame was taken that is recorded, ISO 8601; "": there is none."""
-        if not (self.folder.path / "frames.jsonl").exists():
-            return ""
-        store = FrameStore.open(self.folder.path, readonly=True)
-        try:
-            return max((record.utc for record in store.records()), default="")
-        finally:
-            store.close()
-
-    def _same_sun(self) -> None:
-        """A scan under the sun is not resumed when the sun has gone on: shadows and shading with
-        it. Raises UmbraError(unsuitable)."""
-        spec, ended = self.folder.file.spec, self._broke_off
-        if not isinstance(spec, OccluderScan) or not spec.sun or not ended:
-            return
-        away_s = self._rig.clock.utc_ns() / NS - datetime.fromisoformat(ended).timestamp()
-        gone = away_s / 3600.0 * SUN_DEG_PER_HOUR
-        if gone > spec.drift_deg:
-            raise UmbraError(
-                Code.UNSUITABLE,
-                f"{self.folder.id} cannot be resumed: the sun has gone {gone:.1f} degrees since it "
-                f"broke off, and {spec.drift_deg:g} are allowed (--drift-deg); scan again",
-            )
 
     # ------------------------------------------------------------ during
 

@@ -23,6 +23,9 @@ from protocol.scans.spec import Spec
 
 S = TypeVar("S", bound=Spec)
 
+INCOMPLETE = "incomplete frame"
+"""The reason for which a frame that the camera delivered in part is not used."""
+
 
 class Unsuitable(Exception):
     """The rig cannot do the scan as it was asked for; says what and how to mend it."""

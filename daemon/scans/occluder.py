@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from numpy.typing import NDArray
 
 from daemon.scans.method import (
+    INCOMPLETE,
     Bench,
     Circle,
     Expose,
@@ -22,12 +23,10 @@ from daemon.scans.method import (
     Unsuitable,
     Watch,
 )
-from daemon.scans.pattern_scan import REFERENCES, response_of
+from daemon.scans.parameters import response_of
+from daemon.scans.planned import references
 from daemon.separation.estimator import Components, Lighting, Observation
-from daemon.separation.registration import (
-    Place,
-    Registration,
-)
+from daemon.separation.registration import Place, Registration
 from daemon.separation.strength import SourceStrength
 from daemon.separation.warping import aligned
 from protocol.scans.occluded import OccluderScan
@@ -64,7 +63,6 @@ MOST_WANDERED = 0.3
 """Pixels by which the camera may have moved while its place was learned: beyond it a live
 collection begins anew."""
 
-INCOMPLETE = "incomplete frame"
 LOST = "lost frame"
 CLOUD = "cloud"
 SHAKEN = "moved too far, or too blurred, to be aligned"
@@ -113,7 +111,7 @@ class OccluderMethod(Method[O]):
         self._strengths = (1.0, 1.0)  # of the source, the least and the most
         self._in_vain = _InVain()
         self._short = False  # the video ended uncovered, with most of its frames lost
-        self._references = tuple(Expose(*REFERENCES[reference]) for reference in wanted)
+        self._references = tuple(references(wanted))
         self._watch = Watch(
             self._frames(), motion if self._live else None, self._lights() if self._live else ()
         )

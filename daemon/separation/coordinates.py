@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon.separation.fineness import finer_pattern
 from daemon.separation.handedness import Wave, reversed_pattern
-
-Plane = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import Mask
 
 _PERIOD = 64.0
 """Projector pixels of the wave that a coordinate is made into; finer than this lies no mirror."""

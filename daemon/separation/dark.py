@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Curve, Measurement, NotYet, Observation, Plot
-from daemon.separation.sampling import Moments, Plane, Turns, line
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import Moments, Turns, line
 
 _HOT = 8.0
 """A hot pixel is above its neighbours by so many standard deviations of its mean, and ..."""

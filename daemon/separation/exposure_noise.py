@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from daemon.separation.noise import from_frame
 from daemon.separation.radiometry import Plane, Response
-
-Mask = NDArray[np.bool_]
+from daemon.separation.sampling import Mask
 
 ROUNDING = 1.0 / 12.0
 """Variance of a count's rounding error."""

@@ -20,13 +20,18 @@ from daemon.separation.estimator import Components, Lighting, NotYet, Observatio
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import WaveSums
 from daemon.separation.order import Ranked
-from daemon.separation.order_estimate import Estimated, OrderStatistics
+from daemon.separation.order_estimate import LEAST_FOR_BLUR, Estimated, OrderStatistics
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import NOT_SHIFTS, Mirrors, of_shifts
 from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import HALF, compare
-from daemon.separation.uneven import unevenness
+from daemon.separation.uneven import Uneven, unevenness
+
+_FEW = (
+    "{} patterns do not tell how much the projector blurs: beside edges of the patterns direct is "
+    "too small by more than the stated deviation; {} patterns tell (--patterns, --shifts)"
+)
 
 
 class Extremes:
@@ -173,8 +178,7 @@ class Extremes:
                 own = deviation * np.float32(1.0 / found.uneven)
                 judgement = Judgement(direct_limit, total_limit, own)
             if len(low) > 1:
-                own = found.deviation * np.float32(1.0 / found.uneven)
-                uneven = unevenness(low, high, own, planes, patterns, shifted=self._shifted)
+                uneven = self._unevenness(low, high, found, planes)
                 planes, advice = uneven.planes, advice + uneven.advice
                 flags = uneven.flags if flags is None else flags | uneven.flags
         saturated = self._saturated
@@ -204,13 +208,27 @@ class Extremes:
                 **stated,
                 **mirrors.facts,
                 **steady,
-                "advice": ([] if mirrors.as_declared else [NOT_SHIFTS]) + advice + told.advice(),
+                "advice": [
+                    *([] if mirrors.as_declared else [NOT_SHIFTS]),
+                    *([_FEW.format(patterns, LEAST_FOR_BLUR)] if patterns < LEAST_FOR_BLUR else []),
+                    *advice,
+                    *told.advice(),
+                ],
                 **self._references.facts(source),
             },
         )
 
     def _light(self, samples: NDArray[Any]) -> Plane:
         return self._response.linear(samples) if self._mean is None else samples
+
+    def _unevenness(
+        self, low: Plane, high: Plane, found: Estimated, planes: dict[str, Plane]
+    ) -> Uneven:
+        # Noise is measured where light is bright. Where it is not, a count says nothing: files of
+        # 8 bits are often of fewer.
+        count = self._response.slope(self._response.counts(high[0]))
+        noise = np.maximum(found.deviation * np.float32(1.0 / found.uneven), count)
+        return unevenness(low, high, noise, planes, self._low.frames, shifted=self._shifted)
 
     def _variances(self, found: Estimated, told: Told) -> tuple[Plane, Plane]:
         """Of direct and of global light: of noise, that of the references included."""

@@ -14,13 +14,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon.separation.handedness import Wave
-from daemon.separation.sampling import thinned
-
-Plane = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import Mask, thinned
 
 FINER = 2.2
 """How many times the picture's own rate of change, each way, is a mirror's."""

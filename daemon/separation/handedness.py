@@ -18,10 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.sampling import thinned
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import Mask, thinned
 
-Plane = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Wave = NDArray[np.complex64]
 
 STRONG = 6.0

@@ -24,8 +24,10 @@ from daemon.separation.scan_noise import ScanNoise, Told
 KEEP = 5
 """Samples kept at each end; a checkerboard's 25 shifts light every pixel wholly in 9 or more."""
 
-RANKS = 3
-"""Samples to keep at each end at least: fewer do not tell blur."""
+_RANKS = 3  # samples at each end at least: fewer do not tell blur
+
+LEAST_FOR_BLUR = 2 * _RANKS
+"""Patterns that tell blur."""
 
 LEAST = 4
 """Patterns of which something is known of order: with fewer, there is one sample at an end."""
@@ -104,7 +106,7 @@ class OrderStatistics:
         samples followed are; what both do; and how many times their noise samples differ by."""
         light = self._followed.light()
         groups = None
-        if len(light) >= 2 * RANKS:
+        if len(light) >= LEAST_FOR_BLUR:
             groups = _grouped(np.sort(light, axis=0), self._keep, self._response)
         if groups is None:
             return None, self._models.at(0.0)[1], 1.0

@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-Plane = NDArray[np.float32]
+from daemon.separation.radiometry import Plane
 
 _KNOTS = (
     0.0,

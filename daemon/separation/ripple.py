@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Plane = NDArray[np.float32]
+from daemon.separation.radiometry import Plane
 
 _HARMONICS = 3
 _COLLAPSED = 0.8  # of one: what phases add up to that are all alike

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import NotYet, Observation
+from daemon.separation.radiometry import Plane
 
-Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _BLOCKS = 8

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from daemon.scans import catalog
 from daemon.scans.method import Expose, Taken
 from daemon.separation import frameset
+from daemon.separation.envelope import block_mean
 from daemon.separation.estimator import Components, Lighting, Observation, Quality
 from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.frameset import UNCHECKED, Ceiling, FrameSet
 from daemon.separation.radiometry import Response
-from daemon.separation.single import block_mean
 from protocol.patterns import Axis
 from protocol.scans.anyscan import AnySeparation
 from protocol.scans.projected import (

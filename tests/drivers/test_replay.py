@@ -16,8 +16,9 @@ from drivers.base.camera import Acquisition, CameraSettings, Frame
 from drivers.base.device import Context
 from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, EndOfRecording
 from drivers.base.pixelformat import PixelFormat
+from drivers.recording import natural_key
 from drivers.registry import build
-from drivers.replay import ReplayCamera, ReplayOptions, natural_key
+from drivers.replay import ReplayCamera, ReplayOptions
 
 FREE = Acquisition.FREE
 
