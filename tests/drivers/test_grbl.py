@@ -808,16 +808,6 @@ def test_pulled_while_homing(peer: GrblPeer, stage: GrblStage) -> None:
         stage.home(120.0)
 
 
-def test_another_controller_in_its_place_is_refused(tmp_path: Path) -> None:
-    with GrblPeer(tmp_path, resets_on_open=False, settings=Settings(label="one")) as peer:
-        stage = make(peer)
-        stage.connect()
-        stage.close()
-        peer.settings.label = "two"
-        with pytest.raises(DeviceRefused, match=r"another controller \(two\)"):
-            stage.connect()
-
-
 # ---------------------------------------------------------------- what it says
 
 

@@ -81,11 +81,6 @@ def test_identifies_itself(stage: TmclStage) -> None:
 def test_another_module_is_refused(peer: TmclPeer) -> None:
     with pytest.raises(DeviceRefused, match="1140, not a 1260"):
         make(peer, identity="1260").connect()
-    stage = make(peer)
-    stage.connect()
-    peer.module = 1161
-    with pytest.raises(DeviceRefused, match="another module"):
-        stage.connect()
 
 
 def test_nothing_moves_before_homing(peer: TmclPeer, stage: TmclStage) -> None:
@@ -141,8 +136,13 @@ def test_a_target_off_the_circle_is_refused_with_the_nearest(
         homed.move(14.0, 5.0, FEED)
     with pytest.raises(DeviceRefused):
         homed.move(math.nan, 5.0, FEED)
-    for centre, radius in [((10.0, 5.0), 2.0), ((0.0, 0.0), R), ((10.0, 5.0), math.nan)]:
-        with pytest.raises(DeviceRefused, match="goes round 3 mm"):
+    for centre, radius, words in [
+        ((10.0, 5.0), 2.0, "goes round 3 mm"),
+        ((0.0, 0.0), R, "goes round 3 mm"),
+        ((math.nan, 5.0), R, "goes round 3 mm"),
+        ((10.0, 5.0), math.nan, "radius is nan"),
+    ]:
+        with pytest.raises(DeviceRefused, match=words):
             homed.circle(centre, radius, FEED, 1)
     with pytest.raises(DeviceRefused, match="feed"):
         homed.circle((10.0, 5.0), R, 51.0, 1)
