@@ -16,11 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.exposure import BRIGHTEST, Limits
+from daemon.separation.exposure import BRIGHTEST, TARGET, Limits
 from daemon.separation.radiometry import Response
-
-TARGET = 0.8
-"""Where auto-exposure puts the level, as a share of full scale."""
 
 _TOLERANCE = 0.05  # part of the target by which the level may be off
 _LOOKS = 10  # pictures, at most

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from tests.system.harness import until
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.system
 
 PRODUCTS = ["direct.tiff", "global.tiff", "preview.png", "quality.json", "quality.png",
             "report.html"]  # fmt: skip
