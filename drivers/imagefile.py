@@ -75,18 +75,25 @@ def decode(data: bytes) -> NDArray[Any]:
     return _decode(data, _parser(data)(data))
 
 
-def is_image(path: Path) -> bool:
-    """Whether a file begins like an image format of this module. Raises OSError."""
-    with path.open("rb") as file:
-        return _known(file.read(16)) is not None
+def head(path: Path, size: int) -> bytes:
+    """The first bytes of a file. Raises BadImage for what cannot be read, or is no file."""
+    return _bytes(path, size)
+
+
+def is_image(data: bytes) -> bool:
+    """Whether a file that begins so is in an image format of this module."""
+    return _known(data) is not None
 
 
 # ---------------------------------------------------------------- reading
 
 
-def _bytes(path: Path) -> bytes:
+def _bytes(path: Path, size: int = -1) -> bytes:
     try:
-        return path.read_bytes()
+        if not path.is_file() and path.exists():  # a pipe would be waited for, a device has no end
+            raise BadImage("is no file", "take it out, or give a folder of files or a video")
+        with path.open("rb") as file:
+            return file.read(size)
     except OSError as error:
         raise BadImage(
             f"cannot be read ({error.strerror})", "check that it is there and its permissions"

@@ -39,7 +39,7 @@ class Sequencer:
     """One scan in its course, in the thread that calls `run`."""
 
     def __init__(self, apparatus: Apparatus, exposer: Exposer) -> None:
-        self._its = apparatus
+        self._apparatus = apparatus
         self._exposer = exposer
         self._video = Video(apparatus)
         self.reason = "all steps were exposed"
@@ -49,13 +49,13 @@ class Sequencer:
 
         Raises Revoked (abort), DeviceError, Behind, or what the recorder raises.
         """
-        its = self._its
+        apparatus = self._apparatus
         try:
-            while (step := its.method.step(index, its.recorder.summary)) is not None:
-                its.may_go_on()
-                if its.control.paused:
+            while (step := apparatus.method.step(index, apparatus.recorder.summary)) is not None:
+                apparatus.may_go_on()
+                if apparatus.control.paused:
                     self._exposer.settle()
-                its.checkpoint()
+                apparatus.checkpoint()
                 if isinstance(step, Expose):
                     index, sub = self._exposer.expose(index, step, sub)
                     continue
@@ -79,11 +79,11 @@ class Sequencer:
 
     def _digest(self) -> None:
         """Wait until the estimator knows every frame so far."""
-        recorder = self._its.recorder
-        self._its.when_recorded(lambda seconds: recorder.digested(seconds) or None)
+        recorder = self._apparatus.recorder
+        self._apparatus.when_recorded(lambda seconds: recorder.digested(seconds) or None)
 
     def _stop(self) -> None:
         """Nothing more is exposed, and the recorder may wait long for room: not in this light."""
-        if not self._its.session.ended.is_set():
-            self._its.rest()
-            self._its.set_exposure(None)
+        if not self._apparatus.session.ended.is_set():
+            self._apparatus.rest()
+            self._apparatus.set_exposure(None)

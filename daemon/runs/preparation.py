@@ -25,9 +25,10 @@ from daemon.exposing.motion import require_homed
 from daemon.pictures.viewfinder import Viewfinder
 from daemon.runs.calibration import Calibrations
 from daemon.runs.preconditions import LightWatch, Precondition, Preconditions
+from daemon.runs.resuming import require_same_devices
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Method
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import response_of
 from daemon.separation.metering import Exposure, Level
 from daemon.storage.runfolder import RunFolder
 from daemon.storage.store import Store, estimate_bytes
@@ -98,7 +99,7 @@ class Preparation:
             self._rig.require_ready()
             require_meterable(spec, self._rig.bench())
             if before is not None:
-                self._same_devices(before)
+                require_same_devices(self._folder, before, self._rig.snapshot())
             self._settings = self._configure(session, wanted)
 
         def disk() -> None:
@@ -183,18 +184,6 @@ class Preparation:
             **{name: value for name, value in asdict(in_force).items() if value is not None},
             "pixel_format": camera.device.info().pixel_format.value,
         }
-
-    def _same_devices(self, before: Mapping[str, Any]) -> None:
-        """An interrupted run goes on with the devices that it began with, or not at all."""
-        for name, now in self._rig.snapshot().items():
-            then = before.get(name)
-            if then is None or (then["model"], then["serial"]) != (now["model"], now["serial"]):
-                raise UmbraError(
-                    Code.UNSUITABLE,
-                    f"{self._folder.id} cannot be resumed: its {name} was "
-                    f"{then and then['model']} {then and then['serial']}, "
-                    f"now it is {now['model']} {now['serial']}; scan again",
-                )
 
     def _room(self, planned: int | None) -> None:
         info = self._rig.camera.device.info()

@@ -21,7 +21,7 @@ from daemon.separation.estimator import Components, Lighting, NotYet, Observatio
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import WaveSums
 from daemon.separation.order import Ranked
-from daemon.separation.order_estimate import Estimated, OrderStatistics
+from daemon.separation.order_estimate import LEAST_FOR_BLUR, Estimated, OrderStatistics
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import NOT_SHIFTS, Mirrors, of_shifts
@@ -33,6 +33,10 @@ NOT_LIT_OR_UNLIT = (
     "nearly every pixel has many samples between its darkest and its brightest: the frames are no "
     "patterns of lit and unlit patches (sinusoids are a method of their own, -m sinusoid), or the "
     "patches are so blurred that hardly a pixel is in one (--patch)"
+)
+_FEW = (
+    "{} patterns do not tell how much the projector blurs: beside edges of the patterns direct is "
+    "too small by more than the stated deviation; {} patterns tell (--patterns, --shifts)"
 )
 
 
@@ -209,7 +213,12 @@ class Extremes:
                 **facts,
                 **mirrors.facts,
                 **steady,
-                "advice": self._declared(mirrors, told) + advice + told.advice(),
+                "advice": [
+                    *self._declared(mirrors, told),
+                    *([_FEW.format(patterns, LEAST_FOR_BLUR)] if patterns < LEAST_FOR_BLUR else []),
+                    *advice,
+                    *told.advice(),
+                ],
                 **self._references.facts(source),
             },
         )
@@ -228,11 +237,14 @@ class Extremes:
     def _uneven(
         self, low: Plane, high: Plane, found: Estimated, noises: tuple[Plane, Plane]
     ) -> Uneven:
-        own = found.deviation * np.float32(1.0 / found.uneven)
         if len(low) == 1:
             return Uneven.unknown(low[0])
+        # Noise is measured where light is bright. Where it is not, a count says nothing: files of
+        # 8 bits are often of fewer.
+        count = self._response.slope(self._response.counts(high[0]))
+        noise = np.maximum(found.deviation * np.float32(1.0 / found.uneven), count)
         return unevenness(
-            low, high, own, np.maximum(*noises), self._low.frames, shifted=self._shifted
+            low, high, noise, np.maximum(*noises), self._low.frames, shifted=self._shifted
         )
 
     def _variances(self, found: Estimated, told: Told) -> tuple[Plane, Plane]:

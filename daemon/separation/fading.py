@@ -20,6 +20,7 @@ from daemon.separation.estimator import Quality
 from daemon.separation.finish import bits
 from daemon.separation.handedness import Wave
 from daemon.separation.sampling import gathered
+from daemon.separation.uneven import by_light
 
 Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -88,7 +89,7 @@ def fading(
     part *= np.float32(3**-0.5)
     off: Plane = (part if direct.ndim == 2 else part[..., None]) * direct
     much = off > np.maximum(np.float32(_DEVIATIONS) * direct_std, np.float32(_PART) * total)
-    pixels = much if much.ndim == 2 else np.logical_or.reduce(much, axis=2)
+    pixels = much if much.ndim == 2 else by_light(much, total)
     many = float(np.mean(pixels))
     advice = [_SAID.format(many)] if many > _MANY else []
     short = blur.lost * max(usual - blur.harmless, 0.0) ** 2

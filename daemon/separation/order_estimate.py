@@ -1,8 +1,8 @@
 """Lit and unlit light from the most extreme of a pixel's samples, without what noise and blur do.
 
-Of some pixels all samples are kept (`followed`): they tell the noise, and with it known how far
-apart their ranks lie tells the blur. What these two do to the most extreme samples under the very
-pattern set is simulated (`order_model`), and is taken off at each pixel.
+Of some pixels all samples are kept (`followed`). They tell the noise; and once that is known, the
+distances between their ranked samples tell the blur. What noise and blur do to the most extreme
+samples is simulated for the pattern set at hand (`order_model`), and taken off at each pixel.
 """
 
 from __future__ import annotations
@@ -25,14 +25,16 @@ from daemon.separation.scan_noise import ScanNoise, Told
 KEEP = 5
 """Samples kept at each end; a checkerboard's 25 shifts light every pixel wholly in 9 or more."""
 
-RANKS = 3
-"""Samples to keep at each end at least: fewer do not tell blur."""
+_RANKS = 3  # samples at each end at least: fewer do not tell blur
+
+LEAST_FOR_BLUR = 2 * _RANKS
+"""Patterns that tell blur."""
 
 LEAST = 4
 """Patterns of which something is known of order: with fewer, there is one sample at an end."""
 
 _PLACE = ("lit_place", "unlit_place", "shared_place")
-_GROUPS = 8
+_GROUPS = 8  # of pixels, by their light
 _LEAST = 32  # pixels that make a group
 _DIM = 0.2  # of the brightest pixels' step: with less, a pixel is not looked at
 _TOLD = 10.0  # deviations of noise, of a step whose samples are looked at
@@ -116,11 +118,12 @@ class OrderStatistics:
         return _estimated(blur, model, uneven, (low, high), (dark, lit))
 
     def _explained(self, told: Told) -> tuple[float | None, OrderErrors, float]:
-        """The blur (None: not known) that explains, with the noise, how far apart the ranks of the
-        samples followed are; what both do; and how many times their noise samples differ by."""
+        """What explains the distances between the ranks of the samples that are followed: the blur
+        (None: not known), the errors that it makes together with the noise, and by how many times
+        their noise samples differ."""
         light = self._followed.light()
         groups = None
-        if len(light) >= 2 * RANKS:
+        if len(light) >= LEAST_FOR_BLUR:
             groups = _grouped(np.sort(light, axis=0), self._keep, self._response)
         if groups is None:
             return None, self._models.at(0.0)[1], 1.0
@@ -314,9 +317,9 @@ def _estimated(
 
 
 class _Tables:
-    """A model's columns at evenly spaced logarithms of noise over the raw step of `two` samples,
-    for each number of samples averaged in turn: `biases` of lit and of unlit light by the step,
-    `moments` (variances and covariance) by those of a sample's noise."""
+    """A model's columns, for each number of samples averaged in turn, at evenly spaced logarithms
+    of noise over the raw step (of `two` samples). `biases` of lit and of unlit light are parts of
+    the step, `moments` (variances and covariance) multiples of those of a sample's noise."""
 
     def __init__(self, model: OrderErrors, two: int, keep: int) -> None:
         ratios = np.asarray(RATIOS)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import NotYet, Observation
+from daemon.separation.radiometry import Plane
 
-Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_BLOCKS = 8
-_LEAST_PIXELS = 64
+_BLOCKS = 8  # along each side, for a spread over the picture
+_LEAST_PIXELS = 64  # good ones, to say anything
 _MAD = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 
 

@@ -17,9 +17,9 @@ from daemon.separation.estimator import Lighting
 from daemon.separation.noise import Noise, TemporalNoise, from_frame
 from daemon.separation.radiometry import Plane, Response
 
-_SAMPLE = 4
+_SAMPLE = 4  # noise is measured on every fourth row and column
 _ENOUGH = 100  # samples that make a level's deviation
-_LEVELS = 24
+_LEVELS = 24  # of light, at most, with a deviation each
 _FITTED = 3  # phases that a fit takes
 _MORE = 3.0  # times what a picture shows, an upper bound of noise: that is none
 

@@ -32,9 +32,10 @@ _PART = 0.1  # of the light: an error of more than both is flagged
 _MANY = 0.08  # of the pixels: it is said
 _TINY = np.float32(1e-6)
 _SAID = (
-    "in {:.1%} of the pixels light is not the same under patterns of one lit fraction: it is "
-    "scattered or reflected over less than a checker or patch there, and direct may be too large "
-    "by about the stated deviation; finer patterns (--checker, --patch) tell"
+    "in {:.1%} of the pixels light is not the same under patterns of one lit fraction, and direct "
+    "may be off, most of all too large, by about the stated deviation: light is scattered or "
+    "reflected over less than a checker or patch there (finer patterns tell: --checker, --patch), "
+    "or the projector is out of focus, or something moved"
 )
 
 
@@ -71,10 +72,16 @@ def unevenness(
     """
     error = _error(low, high, noise, patterns, _BOX if shifted else _PATCHES)
     much = error > np.maximum(np.float32(_DEVIATIONS) * known, np.float32(_PART) * high[0])
-    pixels = much if much.ndim == 2 else np.logical_or.reduce(much, axis=2)
+    pixels = much if much.ndim == 2 else by_light(much, high[0])
     flags = bits(pixels, Quality.DISAGREE)
     part = float(np.mean(pixels))
     return Uneven(error, flags, [_SAID.format(part)] if part > _MANY else [])
+
+
+def by_light(much: NDArray[np.bool_], light: Plane) -> NDArray[np.bool_]:
+    """Where colours that hold a third of the light are uneven. A fainter one may be what a
+    camera's correction of colours leaves of the others."""
+    return np.asarray((much * light).sum(axis=2) * 3 >= light.sum(axis=2))
 
 
 def _error(low: Plane, high: Plane, noise: Plane, patterns: int, across: int) -> Plane:

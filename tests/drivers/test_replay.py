@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import struct
 import tracemalloc
 from pathlib import Path
@@ -15,8 +16,9 @@ from drivers.base.camera import Acquisition, CameraSettings, Frame
 from drivers.base.device import Context
 from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, EndOfRecording
 from drivers.base.pixelformat import PixelFormat
+from drivers.recording import natural_key
 from drivers.registry import build
-from drivers.replay import ReplayCamera, ReplayOptions, natural_key
+from drivers.replay import ReplayCamera, ReplayOptions
 
 FREE = Acquisition.FREE
 
@@ -357,6 +359,13 @@ def test_files_that_are_no_images(tmp_path: Path) -> None:
     notes.unlink()
     notes.symlink_to(tmp_path / "gone")
     assert "notes.txt cannot be read (No such file or directory)" in refusal(tmp_path)
+    notes.unlink()
+    notes.symlink_to(notes)
+    assert "notes.txt cannot be read (Too many levels of symbolic links)" in refusal(tmp_path)
+    notes.unlink()
+    os.mkfifo(notes)  # nobody ever writes to it
+    assert "notes.txt is no file" in refusal(tmp_path)
+    assert "notes.txt is no file" in refusal(notes)
 
 
 def test_a_first_file_that_is_missing(tmp_path: Path) -> None:
