@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,11 @@ NOISE = {"direct_std": "direct_noise", "global_std": "global_noise"}
 
 PLANES = frozenset({*NOISE, *NOISE.values()})
 """Planes that have a component's shape."""
+
+
+def of_noise(planes: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
+    """Noise's part of a plane of deviations, which is all of it where it is not a plane itself."""
+    return planes.get(NOISE[name], planes[name])
 
 
 def stated(direct: Plane, indirect: Plane, *off: Plane) -> dict[str, NDArray[Any]]:

@@ -20,6 +20,7 @@ from daemon.separation.estimator import Quality
 from daemon.separation.finish import bits
 from daemon.separation.handedness import Wave
 from daemon.separation.sampling import gathered
+from daemon.separation.uneven import by_light
 
 Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -31,7 +32,7 @@ _ACROSS = 3  # patches that are looked at together
 _SOME = 0.2  # of a neighbourhood must be whole
 _QUIET = 0.1  # of the light: a pixel of more noise tells little
 _EVEN = np.float32(0.005)  # variance of the scattered pattern: where it has less nothing is told
-_BRIGHT = 0.6  # of the strongest contrast: where light is direct the usual fading is looked for
+_BRIGHT = 0.8  # of the strongest contrast: where light is direct the usual fading is looked for
 _SURE = 1.5  # times the usual spread, and the deviation of noise: less says nothing
 _CORE = 3.14  # deviations of a Gaussian over the quarter of it that lies nearest to the middle
 _DEVIATIONS = 3.0  # of noise, and ...
@@ -43,6 +44,19 @@ _SAID = (
     "blur makes it: light is scattered or reflected over less than a patch there, and direct may "
     "be too large by about the stated deviation; finer patterns (--checker, --patch) tell"
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Blurred:
+    """What is usual in a picture and leaves the middles of patches whole (`harmless`), and the part
+    of direct light that they have `lost` by the square of what it is beyond, by simulation."""
+
+    harmless: float
+    lost: float
+
+
+HALVES = Blurred(harmless=1.5, lost=0.01)  # lit and unlit
+PHASES = Blurred(harmless=0.5, lost=0.4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,39 +73,45 @@ def fading(
     wave: Wave,
     contrast: Plane,
     noise: Plane,
-    edge: Mask,
     direct: Plane,
     total: Plane,
     direct_std: Plane,
+    *,
+    blur: Blurred,
 ) -> Faded:
     """What fading leaves unsure of `direct` light, a part of the `total`, whose deviation by noise
-    is `direct_std`, all of a frame's shape; `edge` (H, W): pixels whose contrast does not tell. The
-    rest as in `faded`.
+    is `direct_std`, all of a frame's shape; the rest as in `_faded`.
 
-    Of light that goes with the pattern so anything up to all of it may be direct.
+    Of light that goes with the pattern so anything up to all of it may be direct. Where blur fades
+    the pattern all over the picture, pixels that are taken for whole lack some, too.
     """
-    part = faded(wave, contrast, noise, ~edge) * np.float32(3**-0.5)
+    part, usual = _faded(wave, contrast, noise)
+    part *= np.float32(3**-0.5)
     off: Plane = (part if direct.ndim == 2 else part[..., None]) * direct
     much = off > np.maximum(np.float32(_DEVIATIONS) * direct_std, np.float32(_PART) * total)
-    pixels = much if much.ndim == 2 else np.logical_or.reduce(much, axis=2)
+    pixels = much if much.ndim == 2 else by_light(much, total)
     many = float(np.mean(pixels))
-    return Faded(off, bits(pixels, Quality.DISAGREE), [_SAID.format(many)] if many > _MANY else [])
+    advice = [_SAID.format(many)] if many > _MANY else []
+    short = blur.lost * max(usual - blur.harmless, 0.0) ** 2
+    np.hypot(off, direct * np.float32(short), out=off)
+    return Faded(off, bits(pixels, Quality.DISAGREE), advice)
 
 
-def faded(wave: Wave, contrast: Plane, noise: Plane, whole: Mask) -> Plane:
-    """The part of each pixel's contrast (H, W), 0 to 1, that may not be direct light's.
+def _faded(wave: Wave, contrast: Plane, noise: Plane) -> tuple[Plane, float]:
+    """The part of each pixel's contrast (H, W), 0 to 1, that may not be direct light's; and the
+    usual fading, by blur: the part of a contrast that it loses where the scattered pattern is 0.
 
     `wave` (H, W) complex: the pattern as seen, of any amplitude; `contrast`, a part of the light of
-    deviation `noise`; `whole`: pixels at no edge, whose contrast tells.
+    deviation `noise`.
     """
     none = np.zeros_like(contrast)
     seen = np.asarray(noise < np.float32(_QUIET))  # whatever its contrast
     turn = np.where(seen, wave / np.maximum(np.abs(wave), np.float32(1e-6)), 0)
     size = _patch(turn, seen)
     if size is None:
-        return none
+        return none, 0.0
     scattered = _scattered(turn, seen, _REACH * size)
-    weight = (whole & seen).astype(np.float32)
+    weight = seen.astype(np.float32)
     across = int(_ACROSS * size) // 2 * 2 + 1
     window = across, across
     count = np.asarray(cv2.blur(weight, window))
@@ -103,20 +123,21 @@ def faded(wave: Wave, contrast: Plane, noise: Plane, whole: Mask) -> Plane:
     level, middle = mean(contrast), mean(scattered)
     spread = mean(np.square(scattered)) - np.square(middle)
     told = (count > np.float32(_SOME)) & (spread > _EVEN)
-    lit = told & (weight > 0) & (level > np.float32(_BRIGHT) * np.quantile(contrast, 0.99))
+    lit = told & seen & (level > np.float32(_BRIGHT) * np.quantile(level, 0.9))
     if not lit.any():
-        return none
+        return none, 0.0
     spread[~told], level[~told] = 1.0, 1.0
     going = mean(contrast * scattered) - level * middle
     slope = going / (spread * level)
     # what lies otherwise than the pattern may do so by chance, in as many ways as there are patches
     other = mean(np.square(contrast)) - np.square(level) - np.square(going) / spread
     of_chance = np.maximum(other, 0) / (np.square(level) * spread * np.float32(_ACROSS**2))
-    more = slope - np.float32(gathered(slope[lit]))
-    usual = np.float32((_CORE * np.quantile(np.abs(more[lit]), 0.25)) ** 2)
-    beyond = np.square(np.maximum(more, 0)) - np.float32(_SURE**2) * np.maximum(usual, of_chance)
+    usual = gathered(slope[lit])
+    more = slope - np.float32(usual)
+    core = np.float32((_CORE * np.quantile(np.abs(more[lit]), 0.25)) ** 2)
+    beyond = np.square(np.maximum(more, 0)) - np.maximum(np.float32(_SURE**2) * core, of_chance)
     part: Plane = np.where(told, np.sqrt(np.clip(beyond, 0, 1)), np.float32(0))
-    return part
+    return part, max(usual, 0.0)
 
 
 def _patch(turn: Wave, seen: Mask) -> float | None:

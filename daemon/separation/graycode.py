@@ -149,15 +149,16 @@ class GrayCodeDecoder:
         step = contrast * np.float32(0.5)
         pair_var = np.square(told.deviation(half + step))
         pair_var += np.square(told.deviation(half - step))
-        count, spread = (
-            plane if pair_var.ndim == 2 else plane[..., None] for plane in (fine.count, fine.spread)
+        scatter, spread = (
+            plane if pair_var.ndim == 2 else plane[..., None]
+            for plane in (fine.scatter, fine.spread)
         )
         by = np.float32(1.0 / (1.0 - b))
-        direct_std: Plane = np.sqrt(pair_var / count) * by
+        direct_std: Plane = np.sqrt(pair_var) * scatter * by
         global_var = total.of_references(told.deviation) * np.float32(self._average)
         global_var += pair_var * np.asarray(total.of_half * (0.25 / self._pairs), np.float32)
         global_std: Plane = np.sqrt(np.square(direct_std) + global_var)
-        off = np.broadcast_to(spread * by, direct.shape)
+        off: Plane = np.broadcast_to(spread * by, direct.shape)
         planes = {**stated(direct_std, global_std, off), "stripe": stripe}
         coordinates = self.coordinates(np.float32(SIGNIFICANT) * _grey(deviation))
         planes.update(coordinates)

@@ -7,6 +7,7 @@ an upper bound (`from_picture`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,6 +65,16 @@ class Noise:
         ratio = np.asarray(self.deviations) / expected
         whole = levels > _CLIPPED * expected
         return float(np.median(ratio[whole] if whole.any() else ratio))
+
+    @classmethod
+    def mean(cls, found: Sequence[Noise]) -> Noise:
+        """The mean of some, in whatever order, at each level of those that know it."""
+        levels = np.unique(np.concatenate([one.levels for one in found]))
+        curves = [
+            np.interp(levels, one.levels, one.deviations, left=np.nan, right=np.nan)
+            for one in found
+        ]
+        return cls(tuple(levels.tolist()), tuple(np.nanmean(curves, axis=0).tolist()))
 
     def bounded_by(self, other: Noise) -> Noise:
         """The lower of two upper bounds where both are known, else the one that is."""

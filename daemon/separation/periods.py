@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.radiometry import Plane
+from daemon.separation.uneven import by_light
 
 _AROUND = 9  # pixels across that a difference is averaged over
 _SURE = 2.0  # deviations of that mean: less is noise
@@ -74,7 +75,7 @@ def agreed(solved: Sequence[tuple[Plane, Plane]], periods: Sequence[float], tota
             left = np.sqrt(beyond) * lever
             around = np.maximum(np.float32(_LEFT) * np.sqrt(direct_var), least)
             far |= (left > around) & (off > np.float32(_SURE) * deviation)
-        disagree |= far if far.ndim == 2 else np.logical_or.reduce(far, axis=2)
+        disagree |= far if far.ndim == 2 else by_light(far, total)
     sums /= weights
     squares /= np.square(weights)
     return Agreed(sums, squares, left, disagree)

@@ -18,7 +18,7 @@ from daemon.separation import correspondence
 from daemon.separation.coordinates import other_axis
 from daemon.separation.deviation import stated
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
-from daemon.separation.fading import Faded, fading
+from daemon.separation.fading import PHASES, Faded, fading
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import STRONG, strength
 from daemon.separation.periods import agreed
@@ -115,7 +115,9 @@ class LeastSquares:
         between: dict[str, Any] = {}
         faded: list[str] = []
         if self._patches:
-            split, fade = self._between_patches(ready[0], noise, direct, total, noises[0])
+            split, fade = self._between_patches(
+                ready[0], noise, direct, total, noises[0], np.sqrt(total_var)
+            )
             direct = split.direct
             noises = split.noise(*noises, total, np.sqrt(total_var))
             off += [split.deviation, fade.off]
@@ -134,12 +136,13 @@ class LeastSquares:
         if moved is not None:
             quality |= moved
         misfit = self._noise.misfit
-        disagreeing = float(np.mean((quality & np.uint16(Quality.DISAGREE)) != 0))
+        disagreeing = float(np.mean(solved.disagree))
         facts: dict[str, Any] = {
             "estimator": "lsq",
             "patterns": sum(fit.frames for fit in self._fits),
             "frequencies": len(ready),
             **blur.facts(),
+            "scattering_looked_for": len(ready) > 1 or self._patches,
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
@@ -210,7 +213,13 @@ class LeastSquares:
         return total.light, variance, total.source
 
     def _between_patches(
-        self, fit: WaveFit, noise: Told, direct: Plane, total: Plane, deviation: Plane
+        self,
+        fit: WaveFit,
+        noise: Told,
+        direct: Plane,
+        total: Plane,
+        direct_std: Plane,
+        total_std: Plane,
     ) -> tuple[Split, Faded]:
         """Random phases: what the edges of patches have too little of, and what scattering leaves
         unsure, see `straddling` and `fading`."""
@@ -221,8 +230,11 @@ class LeastSquares:
         mosaic = bool(self._response.bayer)
         own = self._grey_noise(fit, noise) / light
         edge = edges(contrast, own, between, mosaic=mosaic)
-        split = as_neighbours(direct, total, deviation, edge, mosaic=mosaic)
-        return split, fading(wave, contrast, own, edge, split.direct, total, deviation)
+        part = np.clip(direct / np.maximum(total, np.float32(1e-3)), 0, 1)
+        of_part = np.hypot(direct_std, part * total_std)
+        split = as_neighbours(direct, total, of_part, edge, mosaic=mosaic)
+        fade = fading(wave, contrast, own, split.direct, total, direct_std, blur=PHASES)
+        return split, fade
 
     def _grey_noise(self, fit: WaveFit, noise: Told) -> Plane:
         """Of the wave's amplitude (H, W), colours added."""
@@ -304,8 +316,9 @@ def _advice(
         )
     if disagreeing > _MANY:
         lines.append(
-            f"the periods give different direct light in {disagreeing:.0%} of the pixels: the "
-            "frames are not the phases and periods that were declared (--phases, --periods), or "
-            "the coarser patterns are too coarse for this scene"
+            f"the periods give different direct light in {disagreeing:.0%} of the pixels: light is "
+            "scattered or reflected over less than a period there, and direct may be too large by "
+            "about the stated deviation (finer --periods tell), or the frames are not the phases "
+            "and periods that were declared (--phases, --periods)"
         )
     return lines

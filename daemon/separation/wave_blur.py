@@ -25,6 +25,7 @@ from daemon.separation.weave import Woven, rates
 
 _UNSURE = 0.25  # of what a known blur took: it is one figure for all the scene
 _UNKNOWN, _TYPICAL = 0.5, 1.0  # of what so many px take, where it is not known
+_STRONG = np.float32(0.25)  # of the picture's strong waves: weaker ones tell little
 _BLURRED = 0.03  # of direct light: less is not worth saying
 
 
@@ -112,7 +113,7 @@ def _of_periods(fits: Sequence[WaveFit], periods: Sequence[float], weave: float)
     waves = [fit.grey()[1] for fit in fits]
     across = _across(waves[int(np.argmax(periods))])
     means = [np.asarray(cv2.blur(np.abs(wave), (across, across)))[::2, ::2] for wave in waves]
-    bright = means[0] >= np.quantile(means[0], 0.5)  # all where there is no light at all
+    bright = means[0] >= _STRONG * np.quantile(means[0], 0.9)  # all where there is no light
     levels = [np.log(np.maximum(mean[bright], np.float32(1e-6))) for mean in means]
     logs = [gathered(level - levels[0]) for level in levels]
     slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
