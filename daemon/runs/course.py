@@ -206,6 +206,7 @@ class Course:
             rig=rig,
             bench=bench.recorded(),
             calibration=prepared.calibration,
+            estimates=prepared.estimates,
             sequencing=choice.facts(file.sequencing["counts"] if file.sequencing else {}),
         )
         if prepared.waited_s:
