@@ -155,7 +155,7 @@ class Apparatus:
         )
 
     def acquire(self, wanted: Acquisition) -> bool:
-        """Have the camera acquire in this way from now on; whether it did not already."""
+        """Have the camera acquire in this way from now on. True: it did not already."""
         if self._acquisition is wanted:
             return False
         at = self._taken
@@ -191,9 +191,10 @@ class Apparatus:
         return self.when_recorded(self.ring.take)
 
     def when_recorded(self, ask: Callable[[float], T | None]) -> T:
-        """What `ask`, given the seconds that it may wait, has when the recorder has got on.
+        """Call `ask`, with the seconds that it may wait, until it has something to give: until the
+        recorder has caught up.
 
-        There may have been a pause meanwhile, for a disk that is full: nothing may be under way.
+        There may be a pause meanwhile, for a disk that is full, so nothing may be under way.
         Raises Behind, Revoked, or what went wrong in the recorder.
         """
         due = time.monotonic() + RING_S
@@ -229,7 +230,7 @@ class Apparatus:
         return Drawing(pattern, sent, look_of(image))
 
     def drawn(self, pattern: AnyPattern) -> Drawing:
-        """The same, remembered until another one is asked for."""
+        """As `draw`; the last one is remembered."""
         if self._drawing is None or self._drawing.pattern != pattern:
             self._drawing = self.draw(pattern)
         return self._drawing

@@ -45,7 +45,7 @@ from drivers.base.projector import LoadedSequence
 from drivers.sequence import mismatch
 
 WAY = "hardware"
-_LOAD_S = 30.0
+_LOAD_S = 30.0  # deadline of loading a sequence's images
 _START_S = 1.0  # from `run` to the first pulse, beyond a frame's own deadline
 _BEYOND = 1.5  # periods after the last frame in which none may come
 

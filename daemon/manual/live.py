@@ -30,7 +30,7 @@ from drivers.base.errors import DeviceError
 
 SHARE = 0.25
 """Of one processor's time, at most."""
-_PATIENCE_S = 2.0
+_PATIENCE_S = 2.0  # beyond exposure and readout, until a frame is called lost
 
 log = structlog.get_logger(__name__)
 

@@ -1,11 +1,18 @@
 """One run from its first step to its products, in a thread of its own.
 
     prepare -> (replay what an interruption left) -> steps -> products -> end
+       ^                                               │
+       └── a device has failed, and is waited for ─────┘
 
 What comes before the first frame is in `daemon.runs.preparation`, the steps are the sequencer's and
 the recorder's, what others are told meanwhile is in `daemon.runs.standing`; here it is decided what
 an end means: a failure keeps what was recorded, an abort leaves the devices safe, a full disk only
 pauses.
+
+Retry policy. Where the spec waits for what a run needs (`ready.deadline_s`), it waits again for a
+device that was lost or did not answer, and goes on as after an interruption: with a stage that is
+homed, and all frames that were recorded. A device that fails again and again before there is a new
+frame ends the run.
 """
 
 from __future__ import annotations
@@ -26,7 +33,7 @@ from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.control import Control
 from daemon.exposing.exposer import Behind
 from daemon.exposing.modes import Choice, Mode, choose
-from daemon.exposing.recorder import Exposed, Recorder, Tally
+from daemon.exposing.recorder import Exposed, Recorder
 from daemon.exposing.ring import Ring
 from daemon.exposing.sequencer import Sequencer, exposer_for
 from daemon.pictures.viewfinder import Viewfinder
@@ -41,6 +48,7 @@ from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet, Result
 from daemon.storage.durable import StorageError
 from daemon.storage.frames import FrameStore
+from daemon.storage.ledger import Tally
 from daemon.storage.runfolder import RunFolder
 from daemon.storage.store import Store
 from drivers.base.camera import CameraInfo
@@ -58,6 +66,10 @@ _TRUTH_S = 60.0
 """Deadline of a simulated camera's truth, which it computes when it is asked."""
 _SEQUENCE_BYTES = 256 << 20
 """Memory for the frames of hardware-timed sequences, where `ring_frames` are fewer."""
+
+_MENDS = {Code.DEVICE_LOST, Code.DEVICE_TIMEOUT, Code.DEVICE_GARBLED}
+_IN_VAIN = 3
+"""Failures of devices without a new frame between them, after which none is waited for."""
 
 log = structlog.get_logger(__name__)
 
@@ -87,6 +99,7 @@ class Course:
         self._room = Room(store, self.control)
         self._timings: dict[str, float] = {}
         self._reason = ""  # why the steps ended
+        self._failed_at: list[int] = []  # frames that were there when a device failed
 
     # ------------------------------------------------------------ for others
 
@@ -105,7 +118,6 @@ class Course:
     def execute(self) -> End:
         """Run to the end; never raises. The devices are safe when it returns."""
         structlog.contextvars.bind_contextvars(run=self.folder.id)
-        session: Session | None = None
         preparation = Preparation(
             self.folder,
             rig=self._rig,
@@ -117,6 +129,21 @@ class Course:
             on_look=self.standing.looking,
             beat=self.standing.live,
         )
+        while (end := self._attempt(preparation)) is None:
+            log.warning("the run waits for the device, and goes on")
+        begun = self.folder.file.state not in {RunState.QUEUED, RunState.WAITING}
+        if end is self.control.verdict and end.state is RunState.INTERRUPTED and not begun:
+            requeue(self.folder)
+        else:
+            close(self.folder, end, self._timings)
+        self.standing.changed()
+        return end
+
+    def _attempt(self, preparation: Preparation) -> End | None:
+        """Take the devices and go through to the end; None: one failed, and is waited for. The
+        devices are safe when it returns."""
+        session: Session | None = None
+        end: End | None = None
         try:
             session = self._rig.take(f"run {self.folder.id}")
             self.control.check(session)  # what came before there was a session to revoke
@@ -131,23 +158,28 @@ class Course:
             known = as_error(error)
             if known.code is Code.INTERNAL:
                 log.exception("run failed")
-            end = self.control.verdict or End(
-                state=RunState.FAILED, reason=known.message, code=known.code
-            )
+            end = self.control.verdict
+            if end is None and not self._waits_for(known):
+                end = End(state=RunState.FAILED, reason=known.message, code=known.code)
         finally:
             if session is not None:
                 # Whoever revoked the session has sent the devices there already: this waits.
                 futures = self._rig.make_safe(halt=not session.ended.is_set())
                 self._rig.safe_within(futures, SAFE_S)
-                preparation.restore()
+                if end is not None:
+                    preparation.restore()
                 self._rig.leave(session)
-        begun = self.folder.file.state not in {RunState.QUEUED, RunState.WAITING}
-        if end is self.control.verdict and end.state is RunState.INTERRUPTED and not begun:
-            requeue(self.folder)
-        else:
-            close(self.folder, end, self._timings)
-        self.standing.changed()
         return end
+
+    def _waits_for(self, error: UmbraError) -> bool:
+        """Whether the run goes on when what failed is there again."""
+        file = self.folder.file
+        if error.code not in _MENDS or not file.started or not file.spec.ready.deadline_s:
+            return False
+        log.warning("a device failed", problem=error.message)
+        self._failed_at.append(self._recorder.tally.taken if self._recorder else 0)
+        lately = self._failed_at[-_IN_VAIN:]
+        return len(lately) < _IN_VAIN or lately[0] < lately[-1]
 
     def _execute(self, session: Session, preparation: Preparation) -> End:
         began = time.monotonic()
@@ -180,7 +212,7 @@ class Course:
             sequencing=choice.facts(file.sequencing["counts"] if file.sequencing else {}),
         )
         if prepared.waited_s:
-            self._timings["waited_s"] = prepared.waited_s
+            self._timings["waited_s"] = self._timings.get("waited_s", 0.0) + prepared.waited_s
         frames = self._frames(info, resuming)
         try:
             ring = self._ring(choice, bench, method.planned())
@@ -355,7 +387,7 @@ class Course:
             recorded=tally.recorded,
             missing=tally.missing,
             rejected=tally.rejected,
-            sequencing=choice.facts(recorder.exposing),
+            sequencing=choice.facts(recorder.ledger.exposing),
         )
 
     # ------------------------------------------------------------ after
@@ -366,11 +398,11 @@ class Course:
         self.standing.update(state=RunState.FINISHING)
         self.standing.say("writing products")
         began = time.monotonic()
-        lost = recorder.lost_patterns
+        lost = recorder.ledger.lost_patterns
         try:
             result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
         except NotYet as error:
-            raise without_result(error, recorder, self._reason) from None
+            raise without_result(error, recorder.ledger, self._reason) from None
         self._timings["separate_s"] = time.monotonic() - began
         made = separated.write(
             self.folder,

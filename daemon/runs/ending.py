@@ -9,8 +9,8 @@ from typing import Any
 
 import structlog
 
-from daemon.exposing.recorder import Recorder
 from daemon.separation.estimator import NotYet, Result
+from daemon.storage.ledger import Ledger
 from daemon.storage.runfolder import RunFolder
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import End, RunState
@@ -54,17 +54,17 @@ def of_lost(lost: Mapping[int, str]) -> str:
     return f"no frame could be had of {len(lost)} of the patterns ({some}): {why}"
 
 
-def without_result(error: NotYet, recorder: Recorder, reason: str) -> UmbraError:
+def without_result(error: NotYet, ledger: Ledger, reason: str) -> UmbraError:
     """Why a run that came to its end has nothing to show: what is lacking, why it ended then, and
     what became of its frames."""
-    lost, tally = recorder.lost_patterns, recorder.tally
+    lost, tally = ledger.lost_patterns, ledger.tally
     if lost:
         return UmbraError(Code.FRAMES_MISSING, f"{of_lost(lost)}: scan again")
     frames = f"{tally.recorded} frames were recorded"
     if tally.missing:
         frames += f" and {tally.missing} are missing"
     if tally.rejected:
-        frames += f"; {tally.rejected} were not used, the last for: {recorder.why_unused}"
+        frames += f"; {tally.rejected} were not used, the last for: {ledger.why_unused}"
     return UmbraError(
         Code.NO_RESULT, f"there is no result: {error}. It ended for: {reason}. {frames}"
     )

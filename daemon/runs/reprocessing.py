@@ -21,7 +21,6 @@ import msgspec
 import structlog
 
 from daemon.exposing.control import Control
-from daemon.exposing.recorder import Tally
 from daemon.exposing.unusable import named
 from daemon.products import separated
 from daemon.runs.ending import close, end_of, utc_now, with_exposure
@@ -43,6 +42,7 @@ from daemon.scans.method import (
 from daemon.separation.estimator import Components, NotYet, Result
 from daemon.storage.durable import storage
 from daemon.storage.frames import ARRAY, LINES, FrameRecord, FrameStore
+from daemon.storage.ledger import Ledger, Tally
 from daemon.storage.runfolder import RunFile, RunFolder
 from daemon.storage.store import Store, estimate_bytes
 from drivers.clock import RealClock
@@ -80,8 +80,8 @@ class Reprocessing:
         self.control = Control()
         self.standing = Standing(folder, RealClock(), on_change=on_change, on_progress=on_progress)
         self.standing.counts = self
-        self.tally = Tally()
         self.summary: Mapping[str, float] = {}
+        self._ledger = Ledger()
         self._busy = busy
         self._store = store
         self._estimating = threading.Lock()
@@ -89,6 +89,11 @@ class Reprocessing:
         self._timings: dict[str, float] = {}
 
     # ------------------------------------------------------------ for others
+
+    @property
+    def tally(self) -> Tally:
+        """What has become of the parent's frames so far."""
+        return self._ledger.tally
 
     def result(self) -> Result:
         """The result from the frames so far. Raises UmbraError(no_result)."""
@@ -170,7 +175,6 @@ class Reprocessing:
         if method.bench.camera.recorded:
             records = frames.records()[: len(frames)]
             method.foresee(frames.read(r.index) for r in records if not r.missing)
-        missing, seen = dict[int, str](), set[int]()
         scratch = None
         at: tuple[int, Step] | None = None
         for record in frames.records()[: len(frames)]:  # it may be resumed meanwhile
@@ -180,13 +184,9 @@ class Reprocessing:
             if at is None or record.step != at[0]:
                 at = record.step, _as_shown(method, record, self.summary)
             step = at[1]
-            tally = self.tally
             if record.missing:
-                missing[record.observation.pattern] = record.missing
                 method.observe(step, _taken(record, None))  # as when it did not come
-                own.append_missing(record)
-                self.tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
-                self.standing.taken(self.tally)
+                self._note(own.append_missing(record))
                 continue
             scratch = frames.read(record.index, out=scratch)
             with named(record.index, record.source):
@@ -195,22 +195,21 @@ class Reprocessing:
                 else:
                     observation = record.observation
                     method.recall(scratch, observation)
-            own.append(scratch, msgspec.structs.replace(record, observation=observation))
+            kept = own.append(scratch, msgspec.structs.replace(record, observation=observation))
             with self._estimating, named(record.index, record.source):
                 estimator.update(scratch, observation)
                 self.summary = estimator.summary()
             self._conclude = conclude
-            if observation.used:
-                seen.add(observation.pattern)
-            self.tally = Tally(
-                tally.recorded + 1, tally.missing, tally.rejected + (not observation.used)
-            )
             if len(own) % _GROUP_FRAMES == 0:
                 own.commit()
-            self.standing.taken(self.tally)
+            self._note(kept)
             self._give_way(time.monotonic() - began)
         own.commit()
-        return {pattern: why for pattern, why in sorted(missing.items()) if pattern not in seen}
+        return self._ledger.lost_patterns
+
+    def _note(self, record: FrameRecord) -> None:
+        self._ledger.note(record)
+        self.standing.taken(self.tally)
 
     def _give_way(self, took_s: float) -> None:
         """After a frame that took so long: beside a scan, leave it the rest of the time."""

@@ -91,9 +91,9 @@ class Runner(RunLoop[Course]):
                     state=RunState.INTERRUPTED,
                     ended=utc_now(),
                     end=end,
-                    recorded=found.recorded,
-                    missing=found.missing,
-                    sequencing=how and {**how, "counts": found.exposing},
+                    recorded=found.tally.recorded,
+                    missing=found.tally.missing,
+                    sequencing=how and {**how, "counts": dict(found.exposing)},
                 )
                 log.warning("run interrupted", run=run.id)
         self.tend()

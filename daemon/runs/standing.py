@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from daemon.exposing.recorder import Tally
 from daemon.storage.durable import StorageError
+from daemon.storage.ledger import Tally
 from daemon.storage.runfolder import RunFolder
 from drivers.clock import NS, Clock
 from protocol.errors import Code

@@ -35,33 +35,35 @@ from protocol.scans.spec import Reference
 O = TypeVar("O", bound=OccluderScan)  # noqa: E741
 
 MOST_CHANGE = 0.15
-"""Beyond this a change of the source is a cloud: below it, a scale."""
+"""A source that changed by a larger part is behind a cloud, and its frames are not used; after a
+smaller change they are scaled."""
 
 LEAST_CHANGE = 0.005
-"""Within this the source has not changed."""
+"""After a smaller change frames are used as they are."""
 
 LASTING = 50
-"""A source that is brighter than the reference for so many frames in a row is the reference."""
+"""After so many frames in a row that are brighter than the reference, these become the reference:
+the scan began under a cloud."""
 
 VAIN_TURNS = 5
-"""Turns of the circle that cover no more: then it never will."""
+"""After so many turns of the circle without more coverage the scan ends."""
 
 VAIN_FRAMES = 100
 """Frames in use that those turns must have had: fewer say nothing of what the circle reaches,
 however often it went round while others were lost."""
 
 GROWTH = 0.0005
-"""Coverage grows by as much, or noise moves it."""
+"""A smaller rise of the coverage may be noise."""
 
 MANY_LOST = 0.1
-"""A part of the frames, lost, that is to be told with the coverage that they would have brought."""
+"""Where a larger part of the frames was lost, that is the reason given for missing coverage."""
 
 MOST_LOST = 0.5
 """A part of the frames: with as many lost a scan that ends uncovered has failed."""
 
 MOST_WANDERED = 0.3
-"""Pixels by which the camera may have moved while its place was learned: beyond it a live
-collection begins anew."""
+"""Pixels that the camera may move while its place is learned; if it moved further, a live scan
+begins to collect anew."""
 
 LOST = "lost frame"
 CLOUD = "cloud"
@@ -332,8 +334,8 @@ class OccluderMethod(Method[O]):
 
 
 class _InVain:
-    """Counts turns of a circle that brought no coverage; frames that were not used don't count, nor
-    do turns with hardly a frame."""
+    """Counts the turns of a circle since coverage last grew; time in which no frame was used does
+    not count, nor do turns with hardly a frame."""
 
     def __init__(self) -> None:
         self._most = 0.0

@@ -30,6 +30,8 @@ from protocol.scans.spec import Reference
 FINE_PX = 64
 """Patterns of larger checkers, patches or periods may light one end of a scene alone."""
 
+# Where `levels` looks at a pattern set: places of a square of projector pixels, with a margin for
+# blur; all places of a period where it is short, else so many at random.
 _PLACES, _MARGIN, _SAMPLES = 96, 8, 1500
 _REGION = 40
 
@@ -38,7 +40,7 @@ P = TypeVar("P", bound=PatternScan)
 
 @lru_cache(maxsize=128)
 def _drawn(pattern: AnyPattern, side: int) -> NDArray[np.uint8]:
-    """A pattern as it is shown: for many blurs, and for the next scan."""
+    """A pattern as it is shown; cached, for it is needed at many blurs, and by the next scan."""
     return patterns.render(pattern, side, side)
 
 
@@ -178,7 +180,8 @@ class PatternMethod(PlannedMethod[P]):
 
     @property
     def period(self) -> int:
-        """Of the pattern set, in projector pixels along both axes; more than any: it has none."""
+        """Of the pattern set, in projector pixels along both axes; of one without a period, a
+        length that is too large for `levels` to be one."""
         return _REGION + 1
 
     def observe(self, step: Step, taken: Taken) -> Observation:

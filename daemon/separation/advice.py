@@ -33,7 +33,7 @@ from daemon.separation.sampling import Mask, Moments
 _RESOLVED = 0.95  # of the largest size's contrast: a size that has it tells pixel from pixel
 _CHECKER_SD = 1.9  # of a frame's noise: error of 25 shifts by their largest and smallest samples
 _SINUSOID = 12.0  # variance of global, in a frame's, times the number of phases
-_MOST_PHASES = 25
+_MOST_PHASES = 25  # of a sinusoid: beyond, frames are averaged instead
 _WEAVE = 1.0  # of the sinusoids that are advised: a scan's default
 
 

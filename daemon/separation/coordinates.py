@@ -25,7 +25,7 @@ _FAR = 24.0  # projector pixels
 _LAGS = (8, 32)  # pixels to farther ones
 _CLEAR = 2.0  # projector pixels
 _ACROSS = 3.0  # times the change along an axis: the other one's coordinate
-_ENOUGH = 400
+_ENOUGH = 400  # neighbours to compare
 
 
 @dataclass(frozen=True, slots=True)

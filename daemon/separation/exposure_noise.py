@@ -20,7 +20,7 @@ ROUNDING = 1.0 / 12.0
 """Variance of a count's rounding error."""
 
 _SAMPLES = 30_000  # compared of a pattern, on an odd grid: all colours of a mosaic
-_LEVELS = 24
+_LEVELS = 24  # of light, with a deviation each
 _ENOUGH = 50  # samples of a level
 _OUTLIER = 4.0  # deviations
 

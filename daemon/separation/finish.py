@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation import mosaic
+from daemon.separation import deviation, mosaic
 from daemon.separation.estimator import Components, Quality
 from daemon.separation.noise import noise_range
 from daemon.separation.radiometry import Plane, Response
@@ -16,9 +16,6 @@ from daemon.separation.sampling import thinned
 
 SIGNIFICANT = 3.0
 """How many standard deviations tell a component from noise."""
-
-DEVIATIONS = frozenset({"direct_std", "global_std"})
-"""Planes that have a component's shape."""
 
 ADVICE: dict[Quality, tuple[float, str]] = {
     Quality.LOW_MODULATION: (
@@ -110,7 +107,7 @@ def finish(
         # A colour is interpolated from its neighbours: what is wrong with them is wrong with it.
         quality = spread(quality, Quality.SATURATED)
         direct, indirect = (mosaic.demosaic(x, response.bayer) for x in (direct, indirect))
-        for name in DEVIATIONS & planes.keys():
+        for name in deviation.PLANES & planes.keys():
             planes[name] = mosaic.demosaic_deviation(planes[name], response.bayer)
         # Where none of them has a colour, the pixel is what they are.
         missed = ~unknown & np.isnan(direct + indirect).any(axis=2)

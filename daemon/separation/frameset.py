@@ -22,17 +22,17 @@ from daemon.separation.estimator import Components, Estimator, Lighting, Observa
 from daemon.separation.mosaic import orders_of
 from daemon.separation.radiometry import Plane, Response
 
-_SAMPLES = 20_000
+_SAMPLES = 20_000  # of a frame
 _ODD = 0.2  # of the usual light: a frame of few so far from it is none of the set
 _ODD_PAIR = 0.08  # of two, whose usual light is in the middle
 _ODD_AT_LEAST = 0.05  # where many frames say how much it differs from pattern to pattern ...
 _ODD_SPREADS = 8.0  # ... by so many deviations
 _MANY = 6  # frames
 _STEP = 0.04  # of the light: less is a lamp's own unrest
-_STEP_ERRORS = 5.0
+_STEP_ERRORS = 5.0  # standard errors of a step
 _UNEQUAL = 0.05  # of a pair's light, from pair to pair
 _SAME = 0.35  # of the usual difference of two frames in a row: below it they are one pattern
-_MOST_NAMED = 5
+_MOST_NAMED = 5  # frames in a line of advice
 _PRINTS = 4096  # frames whose bits are remembered: of longer scans, the last
 _BRIGHT = {Lighting.WHITE, Lighting.PATTERN}
 _LOOK = 1024  # pixels a side that are looked at for a mosaic

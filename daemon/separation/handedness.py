@@ -28,7 +28,7 @@ STRONG = 6.0
 
 _WINDOW = 5  # pixels over which a phase's slope is taken
 _COHERENT = 0.3  # of the slopes in a window: below, a border runs through it
-_LEAST_MAJORITY = 0.6
+_LEAST_MAJORITY = 0.6  # of the usable pixels must agree on a way round
 _REACH = 41  # pixels, about a find
 
 

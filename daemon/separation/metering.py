@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from daemon.separation.exposure import BRIGHTEST, TARGET, Limits
 from daemon.separation.radiometry import Response
 
-_TOLERANCE = 0.05
-_LOOKS = 10
+_TOLERANCE = 0.05  # part of the target by which the level may be off
+_LOOKS = 10  # pictures, at most
 _CUT = 4.0  # a saturated picture does not say by how much: try a quarter
 _GROW = 16.0  # a dark one is mostly noise: believe it no further
 

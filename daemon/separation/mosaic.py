@@ -15,7 +15,7 @@ Plane = NDArray[np.float32]
 _ORDERS = ("RG", "GR", "GB", "BG")
 _CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype=np.float32)
 _CELL = 16  # pixels a side, whose samples of one place in the mosaic are averaged
-_CELLS = 16
+_CELLS = 16  # that are bright, to say anything
 _COLOURED = 0.08  # of the light: the least difference of colours, as medians over the cells
 _ERRORS = 4.0  # of such a median: noise alone makes no colours
 _GREENS = 0.3  # of that: the greens differ by less

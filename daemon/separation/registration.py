@@ -4,10 +4,10 @@ A shadow's edges outshine the scene's texture, and a mesh's are everywhere: what
 follows the mesh. But the shadow is not where the scene is: against the mean of earlier frames, in
 which it is smeared out, it is noise, and its spectrum can be learned (a mesh's is a few lines).
 Weighted by the inverse of that spectrum the correlation of a frame with the mean has its peak near
-the camera's shift (Knapp and Carter's generalised correlation). Pictures are logarithms of light
-there, so that the source's strength does not matter. The place is then known to a quarter of a
-pixel, and no further: what is left of the shadow pulls. From there `placing.Levels` finds the rest,
-and the turn.
+the camera's shift (Knapp and Carter's generalised correlation). It is taken of logarithms of light,
+so that the source's strength does not matter. That tells the place to a quarter of a pixel and no
+better, because what is left of the shadow pulls; from there `placing.Levels` finds the rest, and
+the turn.
 
 The first frames are the reference: they are aligned among themselves once they are all there.
 """
@@ -44,7 +44,7 @@ Warp = tuple[float, float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 
 _WORK = 320  # longer side of the pictures that are compared
-_LEAST_SIDE = 200
+_LEAST_SIDE = 200  # small pixels of the longer side
 _FLOOR = 0.03  # of the bright places: added to light, so that the dark ones' noise has no say
 _FOLLOWED = 0.25  # of the differences: only a mesh that was taken for the scene explains so much
 _TAPER = 0.08  # part of the picture at each edge that fades out
@@ -64,10 +64,10 @@ _SHARE = 0.35  # of the height that the reference's own peak has
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a frame was taken from: by how much its middle is shifted against the reference's, in
-    pixels, and turned, in radians; `px`: how far the corner that moved most has; what is not more
-    than `least` is not told from none. `found`: it is
-    known, as well as `UNSURE_PX` asks."""
+    """Where a frame was taken from: how far its middle is shifted against the reference's (`x`,
+    `y`, pixels) and how far the frame is turned (radians). `px` is how far the corner moved that
+    moved most; up to `least` that is not told from standing still. `found`: the place is known as
+    well as `UNSURE_PX` asks."""
 
     x: float
     y: float

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from daemon.separation.radiometry import Plane
 
-_HARMONICS = 3
+_HARMONICS = 3  # of the phase that are fitted
 _COLLAPSED = 0.8  # of one: what phases add up to that are all alike
 _ENOUGH = 400  # pixels
 _MOST = 100_000  # pixels that are fitted
-_ROUNDS = 5
+_ROUNDS = 5  # of reweighting
 _OUTLYING = 3.0  # deviations, from where on a pixel has no weight
 
 

@@ -56,7 +56,7 @@ def _status_lines(now: Status, server: str) -> list[tuple[str, str]]:
         ("state", now.state.value),
     ]
     for device in now.devices:
-        model = " ".join(part for part in (device.model or device.driver, device.message) if part)
+        model = " · ".join(part for part in (device.model or device.driver, device.message) if part)
         homed = ", not homed" if device.facts.get("homed") is False else ""
         lines.append((device.name, f"{device.health.value}{homed} · {model}"))
     if now.run is not None:

@@ -63,11 +63,11 @@ def test_a_faint_colour_has_no_say(share: float, flagged: bool) -> None:
     high = np.broadcast_to(uneven, (3, 40, 60, 3)).copy()
     low = high * np.float32(0.2)
     high[1:, :, 30:, 0] *= np.float32(0.6)
-    known = {"direct_std": np.full(high[0].shape, 0.5, dtype=np.float32)}
-    found = unevenness(low, high, known["direct_std"], known, 25, shifted=True)
+    known = np.full(high[0].shape, 0.5, dtype=np.float32)
+    found = unevenness(low, high, known, known, 25, shifted=True)
     assert np.all((found.flags[:, 36:] != 0) == flagged)
     assert not np.any(found.flags[:, :24])
-    assert np.all(found.planes["direct_std"][:, 36:, 0] > 0.1 * uneven[0])
+    assert np.all(found.off[:, 36:, 0] > 0.1 * uneven[0])
     assert bool(found.advice) == flagged
 
 
