@@ -25,7 +25,8 @@ class MeshMethod(OccluderMethod[Mesh]):
     """Circles until every lit pixel was in full light and in the umbra.
 
     Where the mesh's geometry is known, radius and feed are planned from it, and a request that
-    does worse is done all the same, with `warnings`.
+    does worse is done all the same, with `warnings`; `least` is the part of a turn that the circle
+    has every point, at least, in full light, and in the umbra (None: not known, or none).
     """
 
     name: ClassVar[str] = "mesh"
@@ -41,7 +42,7 @@ class MeshMethod(OccluderMethod[Mesh]):
             "scene (--hole-mm, --pitch-mm, --scene-mm)"
         }
         self._mesh = _mesh_of(spec)
-        self._least: float | None = None  # of a turn, in light and in umbra, of the worst point
+        self.least: float | None = None
         wanted = spec.references or ()
         live = not bench.camera.recorded
         if live and Reference.OPEN in wanted:
@@ -58,7 +59,7 @@ class MeshMethod(OccluderMethod[Mesh]):
         super().__init__(spec, bench, self._circle(spec, bench) if live else None)
 
     def _serve(self, circle: geometry.Circle) -> None:
-        self._least = min(circle.lit, circle.unlit) or None
+        self.least = min(circle.lit, circle.unlit) or None
 
     def _circle(self, spec: Mesh, bench: Bench) -> Circle:
         """The motion: as asked for, else as planned."""
@@ -149,17 +150,17 @@ class MeshMethod(OccluderMethod[Mesh]):
                 self.response,
                 hole_fraction=self.hole_fraction,
                 averaged=self.spec.estimator == "auto",
-                least=self._least,
+                least=self.least,
             ),
         )
 
     def uncovered(self) -> str:
         """See `OccluderMethod`."""
-        if self._least is None:
+        if self.least is None:
             return super().uncovered()
         return (
             "by the mesh's geometry this circle lights and shades every point for "
-            f"{self._least:.0%} of a turn at least: what is left changes little by little, as "
+            f"{self.least:.0%} of a turn at least: what is left changes little by little, as "
             "mirrors and translucent things do, or the mesh's shadow does not reach it"
         )
 
