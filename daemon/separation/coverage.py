@@ -16,6 +16,7 @@ from daemon.separation.crossed import Cells, grey_of
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.full_light import FullLight, umbra
+from daemon.separation.gaps import Gaps
 from daemon.separation.noise import Noise, TemporalNoise, noise_range
 from daemon.separation.order import Ranked
 from daemon.separation.radiometry import Plane, Response
@@ -26,6 +27,9 @@ from daemon.separation.warping import without
 DARKEST, BRIGHTEST = 4, 2
 """Samples kept a pixel: enough to tell one frame in the umbra from several."""
 
+_MISSED, _ONCE = 0.01, 0.25
+"""Of the pixels: if more were never in the umbra, or in one frame only, it is said what to do."""
+
 _SAMPLE = 4  # noise is measured on every fourth row and column
 
 
@@ -34,8 +38,9 @@ class Occluder:
 
     L_max = L_d + g L_g and L_min = g L_g with g the part of the source that the occluder leaves
     (a stick: 1), b = 0 in the umbra. `planes["coverage"]` (uint16) counts the frames near a pixel's
-    minimum, up to `DARKEST`; 0 where it was never unlit. `averaged` takes the means of the samples
-    in full light and in the umbra, without it the brightest and the darkest (the paper's).
+    minimum, up to `DARKEST`; 0 where it was never unlit, or in penumbra only. `averaged` takes the
+    means of the samples in full light and in the umbra, without it the brightest and the darkest
+    (the paper's).
     """
 
     def __init__(self, response: Response, *, lit_fraction: float, averaged: bool = True) -> None:
@@ -52,6 +57,7 @@ class Occluder:
         self._lit = FullLight()
         self._table: Plane | None = None  # deviation of a sample, by counts
         self._cells = Cells(self._response)
+        self._gaps = Gaps()
         self._noise = TemporalNoise(self._response.full_scale)
         self._sweeping = Sweeping()
         self._last: NDArray[Any] | None = None  # a sample of the last frame
@@ -77,6 +83,7 @@ class Occluder:
             told = without(pixels, left_out, known)
             self._low.add(told)
             self._high.add(told)
+            self._gaps.add(told)
             frames = self._high.frames
             if frames & (frames - 1) == 0 and (noise := self.noise()) is not None:
                 self._table = noise.deviation(np.arange(self._response.full_scale + 1))
@@ -112,6 +119,7 @@ class Occluder:
         crossed = self._cells.crossed(frames)
         seen = crossed.seen(low, high, deviation)
         never = crossed.never_unlit(seen, high[0], deviation)
+        never |= self._gaps.within(high[0], low[0], deviation, seen)
         coverage = _near_minimum(low, high, deviation)
         single = ~never & seen & (coverage == 1)
         coverage[never] = 0
@@ -144,7 +152,7 @@ class Occluder:
                 "lit_fraction": self._alpha,
                 "leakage": 0.0,
                 **swept,
-                "advice": advice,
+                "advice": [*advice, *_sparse(never, single)],
                 **self._references.facts("ambient frame" if ambient is not None else "none"),
             },
         )
@@ -173,6 +181,17 @@ def _near_minimum(low: Plane, high: Plane, deviation: Plane) -> NDArray[np.uint1
     )
     near = [grey_of(plane) - darkest <= tolerance for plane in low]
     return np.asarray(np.count_nonzero(near, axis=0), dtype=np.uint16)
+
+
+def _sparse(never: NDArray[np.bool_], single: NDArray[np.bool_]) -> list[str]:
+    """What to do where the stick went too far from one frame to the next."""
+    missed, once = float(never.mean()), float(single.mean())
+    if missed <= _MISSED and once <= _ONCE:
+        return []
+    return [
+        f"{missed:.1%} of the pixels were never in the stick's full shadow, and {once:.1%} in a "
+        "single frame: sweep again, more slowly, or with a wider stick, and over all of the scene"
+    ]
 
 
 def _judgement(deviation: Plane, frames: int) -> Judgement:

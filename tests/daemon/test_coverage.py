@@ -130,6 +130,53 @@ def test_one_frame_in_the_umbra_is_kept_and_flagged() -> None:
     assert (several.planes["coverage"][lit] == 4).mean() > 0.95
 
 
+def soft_sweep(step: float, noise: float = 150.0) -> tuple[list[NDArray[Any]], NDArray[Any]]:
+    """Frames of a stick of 12 px with a penumbra of 4 px, and the least light of each column."""
+    rng = np.random.default_rng(9)
+    direct, indirect = scene()
+    columns = np.arange(WIDTH)
+    frames, least = [], np.ones(WIDTH)
+    for middle in np.arange(-12.0, WIDTH + 12, step):
+        passed = np.clip((np.abs(columns - middle) - 6.0) / 4.0 + 0.5, 0, 1)
+        least = np.minimum(least, passed)
+        light = passed * direct + indirect + rng.normal(0, noise, direct.shape)
+        frames.append(np.rint(np.clip(light, 0, 65535)).astype(np.uint16))
+    return frames, least
+
+
+@pytest.mark.parametrize("bayer", ["", "RG"])
+def test_what_saw_but_a_penumbra_is_not_taken_for_shaded(bayer: str) -> None:
+    frames, least = soft_sweep(18.0)
+    found = separate(frames, Response(full_scale=65535, bayer=bayer))
+    lit = np.ones((HEIGHT, WIDTH), dtype=np.bool_)
+    lit[CAST] = lit[DARK] = False
+    penumbra, umbra = (np.broadcast_to(c, lit.shape) & lit for c in (least > 0.4, least == 0))
+    assert 0.1 < penumbra.mean() < umbra.mean()
+    never = flagged(found, Quality.NEVER_UNLIT)
+    assert never[penumbra].mean() > 0.95
+    assert np.isnan(found.direct[penumbra]).mean() > 0.95
+    assert (found.planes["coverage"][never] == 0).all()
+    assert never[umbra].mean() < 0.01
+    assert not never[36:60, 60:84].any()  # the scene's own shadow
+    assert flagged(found, Quality.SINGLE)[umbra].mean() > 0.99
+    (line,) = [line for line in found.facts["advice"] if "sweep again" in line]
+    assert "in a single frame" in line
+
+
+def test_a_slow_sweep_has_no_gaps_whatever_the_scene() -> None:
+    rng = np.random.default_rng(10)
+    print_ = rng.uniform(0.05, 1.0, (HEIGHT, WIDTH))  # of direct alone: depths of all kinds
+    frames, _ = soft_sweep(2.0)
+    rest = np.rint(scene()[1])
+    found = separate(
+        [np.rint(rest + (f - rest) * print_).clip(0).astype(np.uint16) for f in frames]
+    )
+    lit = np.ones((HEIGHT, WIDTH), dtype=np.bool_)
+    lit[CAST] = lit[DARK] = False
+    assert flagged(found, Quality.NEVER_UNLIT)[lit].mean() < 0.005
+    assert not [line for line in found.facts["advice"] if "sweep again" in line]
+
+
 def test_frames_without_a_shadow_do_no_harm() -> None:
     frames = sweep([*[WIDTH + 1] * 20, *WHOLE, *[WIDTH + 1] * 20])
     found = separate(frames)
