@@ -1,0 +1,218 @@
+"""Separation under a stick that is swept over the scene (§4.2).
+
+A pixel is in full light for most of a sweep, so that its level there is a mean of many frames: the
+brightest of them is noise, or an edge that a shaken camera brought there. In the umbra it may have
+been once. What the shadow never reached is not known (`coverage`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.separation.coverage import Cells, cells_of, near_minimum, never_unlit, seen_to_fall
+from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.finish import Judgement, bits, finish
+from daemon.separation.gathered import FullLight, Umbra
+from daemon.separation.levels import Levels, split_behind
+from daemon.separation.noise import Noise, TemporalNoise, noise_range
+from daemon.separation.order import Ranked
+from daemon.separation.radiometry import Plane, Response
+from daemon.separation.references import References
+from daemon.separation.sweeping import Sweeping
+from daemon.separation.warping import without
+
+DARKEST, BRIGHTEST = 4, 2
+"""Samples kept a pixel: enough to tell one frame in the umbra from several."""
+
+_WHOLE = 0.9  # of the end of the scale
+_SAMPLE = 4  # noise is measured on every fourth row and column
+
+
+class Occluder:
+    """Frames of a scene swept by an occluder's shadow -> direct, global, coverage.
+
+    L_max = L_d + g L_g and L_min = g L_g with g the part of the source that the occluder leaves
+    (a stick: 1), b = 0 in the umbra. `planes["coverage"]` (uint16) counts the frames near a pixel's
+    minimum, up to `DARKEST`; 0 where it was never unlit. `averaged` takes the means of the samples
+    in full light and in the umbra and states what noise leaves in them (`planes` direct_std,
+    global_std); without it the brightest and the darkest (the paper's), whose error is a bias.
+    """
+
+    def __init__(self, response: Response, *, lit_fraction: float, averaged: bool = True) -> None:
+        self._response = response
+        self._averaged = averaged
+        self._alpha = lit_fraction
+        self._references = References(response)
+        self._unused = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._low = Ranked(DARKEST, largest=False)
+        self._high = Ranked(BRIGHTEST, largest=True)
+        self._lit = FullLight()
+        self._umbra = Umbra()
+        self._table: Plane | None = None  # deviation of a sample, by counts
+        self._cell_low: Plane | None = None
+        self._cell_high: Plane | None = None
+        self._pixel_noise = TemporalNoise(self._response.full_scale)
+        self._cell_noise = TemporalNoise(self._response.full_scale)
+        self._sweeping = Sweeping()
+        self._last: tuple[NDArray[Any], Plane] | None = None
+        self._moved = False  # the last frame was interpolated
+
+    def update(
+        self,
+        pixels: NDArray[Any],
+        observation: Observation,
+        left_out: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """See `Extremes`."""
+        if not observation.used:
+            self._unused += 1
+        elif observation.lighting is not Lighting.PATTERN:
+            self._references.add(pixels, observation.lighting)
+        else:
+            if observation.fresh:
+                self._unused += self._high.frames
+                self._begin()
+            pixels = self._response.scaled(pixels, 1.0 / observation.strength)
+            known = (self._high.planes[0], self._low.planes[0]) if self._high.frames else None
+            told = without(pixels, left_out, known)
+            self._low.add(told)
+            self._high.add(told)
+            frames = self._high.frames
+            if frames & (frames - 1) == 0 and (noise := self.noise()) is not None:
+                self._table = noise.deviation(np.arange(self._response.full_scale + 1))
+            self._lit.add(told, self._high.planes[1], self._low.planes[0], self._table)
+            self._umbra.add(told, self._low.planes, self._table)
+            self._sweeping.add(pixels)
+            self._watch(pixels, observation.warp is not None)
+
+    def _watch(self, pixels: NDArray[Any], moved: bool) -> None:
+        """Keep what tells of noise and of the shadow's way."""
+        cells = cells_of(pixels)
+        sample = np.ascontiguousarray(pixels[::_SAMPLE, ::_SAMPLE])
+        if self._cell_low is None or self._cell_high is None:
+            self._cell_low, self._cell_high = cells.copy(), cells.copy()
+        else:
+            np.minimum(self._cell_low, cells, out=self._cell_low)
+            np.maximum(self._cell_high, cells, out=self._cell_high)
+        if self._last is not None:
+            interpolated = moved or self._moved
+            self._pixel_noise.add(self._last[0], sample, interpolated=interpolated)
+            self._cell_noise.add(self._last[1], cells)
+        self._last, self._moved = (sample, cells), moved
+
+    def brightest(self) -> NDArray[Any] | None:
+        """See `Extremes`."""
+        return self._high.planes[0] if self._high.frames else None
+
+    def noise(self) -> Noise | None:
+        """See `Extremes`."""
+        found = self._pixel_noise.noise()
+        return None if found is None else _by_brighter(found, self._response)
+
+    def result(self) -> Components:
+        """See `Estimator`. Raises NotYet before two frames are in."""
+        frames = self._high.frames
+        if frames < 2:
+            raise NotYet(f"an occluder's sweep needs 2 frames, {frames} came so far")
+        low = self._response.linear(self._low.planes)
+        high = self._response.linear(self._high.planes)
+        noise = self.noise()
+        deviation = self._response.deviation(noise, self._high.planes[0])
+        cells = self._cells(frames)
+        seen = seen_to_fall(low, high, deviation, frames, cells)
+        never = never_unlit(seen, high[0], deviation, frames, cells)
+        coverage = near_minimum(low, high, deviation)
+        single = ~never & seen & (coverage == 1)
+        coverage[never] = 0
+        split = split_behind(
+            self._levels(noise), self._alpha, self._references, self._response, noise
+        )
+        planes: dict[str, NDArray[Any]] = {"coverage": coverage}
+        judged = Judgement.of_extremes(deviation, frames)
+        if self._averaged:
+            planes |= {"direct_std": split.direct_std, "global_std": split.global_std}
+            judged = _judgement(deviation, frames)
+        swept, advice = self._sweeping.told()
+        return finish(
+            split.direct,
+            split.indirect,
+            response=self._response,
+            brightest=high[0],
+            saturated=self._high.planes[0] >= self._response.saturated_from,
+            flags=bits(never, Quality.NEVER_UNLIT) | bits(single, Quality.SINGLE),
+            planes=planes,
+            judgement=judged,
+            facts={
+                "estimator": "plateau" if self._averaged else "maxmin",
+                "frames": frames,
+                "unused_frames": self._unused,
+                "lit_fraction": self._alpha,
+                "leakage": 0.0,
+                **swept,
+                "advice": advice,
+                **self._references.facts(split.source),
+            },
+        )
+
+    def _levels(self, noise: Noise | None) -> Levels:
+        """The light in full light and in the umbra: means, or the extremes."""
+        brightest, darkest = self._high.planes[0], self._low.planes[0]
+        told = np.ones(darkest.shape[:2], np.float32)
+        if not self._averaged:
+            one = np.ones(darkest.shape, np.uint16)
+            return Levels.of_counts(self._response, noise, (brightest, one), (darkest, one), told)
+        table = None if noise is None else noise.deviation(np.arange(self._response.full_scale + 1))
+        bright = self._lit.level(self._high.planes[1], darkest, self._table)
+        dark = self._umbra.level(self._low.planes, bright[0], table)
+        return Levels.of_counts(self._response, noise, bright, dark, told)
+
+    def _cells(self, frames: int) -> Cells:
+        """What the cells' means tell of the shadow's way."""
+        if self._cell_low is None or self._cell_high is None:
+            raise NotYet("no frame has come yet")
+        noise = self._cell_noise.noise()
+        return Cells.of(self._cell_low, self._cell_high, self._response, noise, frames)
+
+    def summary(self) -> dict[str, float]:
+        """Frames, those not used, the part of the picture that the shadow has crossed, and the
+        coverage: the part crossed of what it would show on."""
+        frames = self._high.frames
+        covered = coverage = 0.0
+        if frames >= 2:
+            cells = self._cells(frames)
+            covered = float(cells.crossed.mean())
+            if covered > 0.0:
+                missed = float(cells.never().mean())
+                coverage = covered / (covered + missed)
+        return {
+            "frames": float(frames),
+            "unused": float(self._unused),
+            "covered": covered,
+            "coverage": coverage,
+        }
+
+
+def _by_brighter(noise: Noise, response: Response) -> Noise:
+    """No level's light has more noise than that of brighter ones. In a fast sweep hardly a pixel of
+    the umbra stays there, and what it changes by is not noise."""
+    levels = np.asarray(noise.levels, dtype=np.float32)
+    slope = response.slope(levels)
+    light = np.asarray(noise.deviations, dtype=np.float32) * slope
+    whole = levels < _WHOLE * response.saturated_from  # beyond, noise is cut off
+    if not whole.any():
+        return noise
+    light[whole] = np.minimum.accumulate(light[whole][::-1])[::-1]
+    return Noise(noise.levels, tuple(float(x) for x in light / slope))
+
+
+def _judgement(deviation: Plane, frames: int) -> Judgement:
+    """Of a pixel that nothing happens to, noise makes the darkest of so many samples by half of the
+    range darker than the mean."""
+    limit = np.float32(noise_range(frames) / 2 + 2.0) * deviation
+    return Judgement(limit, limit, deviation)
