@@ -18,12 +18,14 @@ import signal
 import sys
 import threading
 from collections.abc import Coroutine
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import structlog
 import zmq
 import zmq.asyncio
+from numpy.typing import NDArray
 
 from daemon import __version__, config, logs
 from daemon.devices.rig import SAFE_S, Rig
@@ -46,7 +48,7 @@ from protocol.wire import MOST_BYTES
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """What ends the daemon in an orderly way: the service manager, Ctrl-C, a terminal that closes."""
 
-_TEND_S = 1.0
+_TEND_S = 1.0  # how often leases, reconnections and unwritten states are looked after
 _SWITCH_S = 0.0005
 """Python's switch interval: commands must not wait 5 ms for a thread that computes."""
 
@@ -120,18 +122,17 @@ class _Daemon:
             access.start()
             stack.callback(access.stop)
             commands_socket = self._bind(context, zmq.ROUTER, access, self._config.network.command)
-            events_socket = self._bind(context, zmq.PUB, access, self._config.network.events)
+            events_socket = self._bind(context, zmq.XPUB, access, self._config.network.events)
             publisher = Publisher(zmq.Socket.shadow(events_socket), epoch)
-
+            stack.enter_context(publisher.admitting(loop))
             self._publish_log(loop, stack, store, publisher)
 
-            def publish(body: AnyEvent) -> None:
-                loop.call_soon_threadsafe(publisher.publish, body)
+            def publish(body: AnyEvent, **arrays: NDArray[Any]) -> None:
+                loop.call_soon_threadsafe(partial(publisher.publish, body, **arrays))
 
             def glimpsed(glimpse: Glimpse) -> None:
                 body = PreviewTaken(run=glimpse.run, what=glimpse.what, facts=glimpse.facts)
-                arrays = {"preview": glimpse.picture, "saturated": glimpse.saturated}
-                loop.call_soon_threadsafe(lambda: publisher.publish(body, **arrays))
+                publish(body, preview=glimpse.picture, saturated=glimpse.saturated)
 
             def changed() -> None:
                 loop.call_soon_threadsafe(commands.changed)
@@ -287,7 +288,7 @@ class _Daemon:
     ) -> zmq.asyncio.Socket:
         socket = context.socket(kind)
         socket.linger = 0
-        if kind == zmq.PUB:
+        if kind == zmq.XPUB:
             socket.sndhwm = HIGH_WATER
         else:
             socket.setsockopt(zmq.ROUTER_HANDOVER, 1)

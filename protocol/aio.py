@@ -12,7 +12,7 @@ import logging
 import time
 import weakref
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -30,6 +30,7 @@ from protocol.connection import (
     GivenKeys,
     Inbox,
     Notice,
+    deaf,
     dealer,
     events_endpoint,
     id_of,
@@ -179,17 +180,21 @@ class AsyncClient(Awaited, Commands):
 
     # -------------------------------------------------------- events
 
-    def subscribe(self, *topics: str) -> AsyncEventStream:
+    def subscribe(self, *topics: str, joined: bool = True) -> AsyncEventStream:
         """The rig's events as they come: run, progress, queue, device, rig, preview.
 
-        No topic means all but previews. Close it, or use it as a context manager.
+        No topic means all but previews. Close it, or use it as a context manager, which with
+        `joined` waits until the rig has heard of it: of what happens then, nothing is missed. It
+        raises UmbraError(unreachable) where no events come within the time-out.
         """
         endpoint = events_endpoint(self.welcome, self.endpoint)
         stream = AsyncEventStream(
             [
                 subscriber(self._context, endpoint, self.keys, names, hwm)
                 for names, hwm in split_topics(topics)
-            ]
+            ],
+            endpoint,
+            self.timeout_s if joined else None,
         )
         self._streams.add(stream)
         return stream
@@ -270,26 +275,39 @@ class _Line:
 class AsyncEventStream:
     """Events, one after the other; made by `AsyncClient.subscribe`."""
 
-    def __init__(self, sockets: list[zmq.asyncio.Socket]) -> None:
-        self._sockets = sockets
+    def __init__(
+        self, sockets: list[zmq.asyncio.Socket], endpoint: str, join_s: float | None
+    ) -> None:
+        self._sockets, self._endpoint, self._join_s = sockets, endpoint, join_s
         self._inbox = Inbox()
         self._waiting: deque[Notice] = deque()
 
     async def next(self, timeout_s: float | None = None) -> Notice | None:
         """The next event, or None after `timeout_s` without one and when the stream is closed."""
+        there = await self._received(lambda: bool(self._waiting), timeout_s)
+        return self._waiting.popleft() if there else None
+
+    async def join(self, timeout_s: float) -> None:
+        """Wait until the rig has heard of all subscriptions; else close, and raise UmbraError."""
+        sockets, joined = self._sockets, self._inbox.joined
+        if not await self._received(lambda: len(joined) >= len(sockets), timeout_s):
+            self.close()
+            raise deaf(self._endpoint, timeout_s)
+
+    async def _received(self, enough: Callable[[], bool], timeout_s: float | None) -> bool:
         until = None if timeout_s is None else time.monotonic() + timeout_s
         poller = zmq.asyncio.Poller()
         for socket in self._sockets:
             poller.register(socket, zmq.POLLIN)
-        while not self._waiting:
+        while not enough():
             if any(socket.closed for socket in self._sockets):
-                return None
+                return False
             left = None if until is None else until - time.monotonic()
             if left is not None and left <= 0:
-                return None
+                return False
             await poller.poll(None if left is None else max(1, int(left * 1000)))
             self._waiting.extend(self._inbox.take(await self._drained()))
-        return self._waiting.popleft()
+        return True
 
     async def _drained(self) -> list[list[zmq.Frame]]:
         messages = []
@@ -314,6 +332,8 @@ class AsyncEventStream:
             socket.close()
 
     async def __aenter__(self) -> AsyncEventStream:
+        if self._join_s is not None:
+            await self.join(self._join_s)
         return self
 
     async def __aexit__(self, *error: object) -> None:

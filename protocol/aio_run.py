@@ -33,7 +33,7 @@ class AsyncRun(Known):
     async def progress(self) -> AsyncGenerator[Progress, None]:
         """How the run goes on, until it has ended: see `protocol.run.Run.progress`."""
         following = Following(self.id)
-        async with self._rig.subscribe("run", "progress") as events:
+        async with self._rig.subscribe("run", "progress", joined=False) as events:
             news = await self._snapshot(following)
             while True:
                 if news is not None:

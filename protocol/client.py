@@ -11,7 +11,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, TypeVar
@@ -28,6 +28,7 @@ from protocol.connection import (
     GivenKeys,
     Inbox,
     Notice,
+    deaf,
     dealer,
     events_endpoint,
     id_of,
@@ -187,18 +188,24 @@ class Client(Blocking, Commands):
 
     # -------------------------------------------------------- events
 
-    def subscribe(self, *topics: str) -> EventStream:
+    def subscribe(self, *topics: str, joined: bool = True) -> EventStream:
         """The rig's events as they come: run, progress, queue, device, rig, preview.
 
-        No topic means all but previews. Close it, or use it as a context manager.
+        No topic means all but previews. Close it, or use it as a context manager. With `joined`
+        it waits until the rig has heard of it: of what happens then, nothing is missed. Raises
+        UmbraError(unreachable) where no events come within the time-out.
         """
         endpoint = events_endpoint(self.welcome, self.endpoint)
-        return EventStream(
+        stream = EventStream(
             [
                 subscriber(self._context, endpoint, self.keys, names, hwm)
                 for names, hwm in split_topics(topics)
-            ]
+            ],
+            endpoint,
         )
+        if joined:
+            stream.join(self.timeout_s)
+        return stream
 
     # -------------------------------------------------------- the lock
 
@@ -228,8 +235,8 @@ class Client(Blocking, Commands):
 class EventStream(Iterator[Notice]):
     """Events, one after the other; made by `Client.subscribe`. For one thread."""
 
-    def __init__(self, sockets: list[zmq.Socket[bytes]]) -> None:
-        self._sockets = sockets
+    def __init__(self, sockets: list[zmq.Socket[bytes]], endpoint: str) -> None:
+        self._sockets, self._endpoint = sockets, endpoint
         self._inbox = Inbox()
         self._waiting: deque[Notice] = deque()
 
@@ -237,17 +244,27 @@ class EventStream(Iterator[Notice]):
         """The next event, or None after `timeout_s` without one and when the stream is closed."""
         if any(socket.closed for socket in self._sockets):
             return None
+        there = self._received(lambda: bool(self._waiting), timeout_s)
+        return self._waiting.popleft() if there else None
+
+    def join(self, timeout_s: float) -> None:
+        """Wait until the rig has heard of all subscriptions; else close, and raise UmbraError."""
+        if not self._received(lambda: len(self._inbox.joined) >= len(self._sockets), timeout_s):
+            self.close()
+            raise deaf(self._endpoint, timeout_s)
+
+    def _received(self, enough: Callable[[], bool], timeout_s: float | None) -> bool:
         until = None if timeout_s is None else time.monotonic() + timeout_s
         poller = zmq.Poller()
         for socket in self._sockets:
             poller.register(socket, zmq.POLLIN)
-        while not self._waiting:
+        while not enough():
             left = None if until is None else until - time.monotonic()
             if left is not None and left <= 0:
-                return None
+                return False
             poller.poll(None if left is None else max(1, int(left * 1000)))
             self._waiting.extend(self._inbox.take(self._drained()))
-        return self._waiting.popleft()
+        return True
 
     def _drained(self) -> list[list[zmq.Frame]]:
         messages = []

@@ -30,7 +30,7 @@ from protocol.errors import Code, UmbraError
 from protocol.keys import ClientKeys
 from protocol.messages.access import DEFAULT_COMMAND
 from protocol.messages.commands import AnyCommand
-from protocol.messages.envelopes import PROTOCOL, Event, Request, Response
+from protocol.messages.envelopes import JOINED, PROTOCOL, Event, Request, Response
 from protocol.messages.events import AnyEvent, Logged, PreviewTaken
 from protocol.messages.replies import AnyReply, Reply, Welcome
 from protocol.wire import MOST_BYTES, Arrays, arrays_of, decode, encode
@@ -139,6 +139,15 @@ def unreachable(endpoint: str, timeout_s: float, keys: ClientKeys | None) -> Umb
     return UmbraError(Code.UNREACHABLE, message)
 
 
+def deaf(endpoint: str, timeout_s: float) -> UmbraError:
+    """The error where the rig answers, and its events don't come."""
+    return UmbraError(
+        Code.UNREACHABLE,
+        f"the rig answers, but no events came from {endpoint} in {timeout_s:g} s: "
+        "is that port open between here and there?",
+    )
+
+
 # ---------------------------------------------------------------- sockets
 
 
@@ -167,13 +176,13 @@ def subscriber(
     topics: Sequence[str],
     hwm: int,
 ) -> S:
-    """A socket for events, with a bounded queue."""
+    """A socket for events, with a bounded queue; the rig says when it has joined (see Inbox)."""
     socket = context.socket(zmq.SUB)
     socket.linger = 0
     socket.rcvhwm = hwm
     socket.ipv6 = "[" in endpoint
     _secure(socket, keys)
-    for topic in topics:
+    for topic in (*topics, f"{JOINED}{uuid.uuid4().hex}"):
         socket.subscribe(topic)
     socket.connect(endpoint)
     return socket
@@ -300,9 +309,13 @@ class Notice:
 
 
 class Inbox:
-    """Messages from the event sockets become notices: gaps are marked, old previews dropped."""
+    """Messages from the event sockets become notices: gaps are marked, old previews dropped.
+
+    `joined` are the sockets that the rig has heard of, each by a topic of its own.
+    """
 
     def __init__(self) -> None:
+        self.joined: set[bytes] = set()
         self._last: dict[str, int] = {}
         self._epoch = ""
 
@@ -317,6 +330,9 @@ class Inbox:
         ]
 
     def _notice(self, frames: Sequence[zmq.Frame]) -> Notice | None:
+        if frames[0].bytes.startswith(JOINED.encode()):
+            self.joined.add(frames[0].bytes)
+            return None
         try:
             event = decode(_events, frames[1].buffer if len(frames) > 1 else b"")
             arrays = arrays_of(event.arrays, [frame.buffer for frame in frames[2:]])

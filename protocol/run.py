@@ -88,7 +88,7 @@ class Run(Known):
 
     def _followed(self, topics: tuple[str, ...], until: float | None) -> Iterator[Progress]:
         following = Following(self.id)
-        with self._rig.subscribe(*topics) as events:
+        with self._rig.subscribe(*topics, joined=False) as events:
             news = self._snapshot(following)
             while True:
                 if news is not None:

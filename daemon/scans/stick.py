@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 from daemon.scans.method import Bench, Sweep, Unsuitable
 from daemon.scans.occluder import OccluderMethod
+from daemon.separation.coverage import Occluder
 from daemon.separation.estimator import Components, Estimator
 from daemon.separation.steadied import Steadied
-from daemon.separation.stick import Occluder
 from drivers.base.stage import StageInfo
 from protocol.patterns import Axis
 from protocol.penumbra import beside_a_stick, penumbra_mm

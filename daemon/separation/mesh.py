@@ -273,9 +273,10 @@ def _advice(beta: float | None, pull: dict[str, float]) -> list[str]:
     lines = []
     if beta is not None:
         lines.append(
-            f"light that is not the source's (sky, room), if any, counts {1.0 / beta:.2g} times in "
-            "global: a frame with the source off takes it out (of a scan: --references ambient; of "
-            "a recording: --ambient-frame, or --open-frame for one without the mesh)"
+            f"light that is not the source's (sky, room) or reaches the scene past the mesh, if "
+            f"any, counts {1.0 / beta:.2g} times in global: a frame with the source off takes out "
+            "the first (of a scan: --references ambient; of a recording: --ambient-frame), with "
+            "one without the mesh (--open-frame) both"
         )
     if pull.get("direct", 0.0) > _PULLED:
         lines.append(

@@ -38,7 +38,7 @@ is a matter of noise, too (1.02 to 1.39 on simulated and rendered scenes)."""
 Part = tuple[slice, slice]
 WHOLE: Part = (slice(None), slice(None))
 
-_KEPT = 2
+_KEPT = 2  # samples of each end that are kept in order: a level begins with them
 _COUNTED = 256  # samples from which on the second most extreme of them is taken for as far off
 _MOST = 65_535  # samples that are counted, and averaged
 _CHUNK = 1 << 15  # samples that are worked on at a time, so that they stay in the cache

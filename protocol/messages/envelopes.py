@@ -15,6 +15,11 @@ PROTOCOL = 1
 """The one version of everything in this package; both sides must have the same."""
 
 
+JOINED = "joined/"
+"""Topics with this prefix are answered, each with an event of that name and no header: what was
+subscribed to before it is then known to the rig, and nothing that happens later is missed."""
+
+
 class ArrayHeader(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One raw buffer that follows the header: C order, native little endian."""
 

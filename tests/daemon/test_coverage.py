@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.separation.coverage import Occluder
 from daemon.separation.estimator import Components, NotYet, Observation, Quality
 from daemon.separation.radiometry import Response
-from daemon.separation.stick import Occluder
 
 HEIGHT, WIDTH = 96, 160
 DEEP = Response(full_scale=65535)

@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import pytest
 
-from daemon import config
 from daemon.config import SequencerSection
 from daemon.devices.devicethread import Revoked, Session
 from daemon.devices.lightmeter import LightMeter, require_meterable
@@ -26,27 +25,16 @@ from daemon.exposing.ring import Ring
 from daemon.exposing.sequencer import Sequencer, exposer_for
 from daemon.exposing.video import Video
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Circle, Method, Unsuitable, Watch
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.method import Circle, Expose, Method, Unsuitable, Watch
+from daemon.scans.parameters import response_of
 from drivers.base.camera import CameraSettings
 from drivers.clock import NS, Clock
 from protocol.messages.runs import RunState
 from protocol.scans.projected import TwoImage
 from protocol.scans.spec import Radiometry
+from tests.daemon.small_rig import small_rig
 
-RIG = """
-[rig]
-time_scale = 20
-[projector]
-driver = "virtual"
-width = 64
-height = 48
-[camera]
-driver = "virtual"
-width = 64
-height = 48
-noise = false
-{camera}
+STAGE_AND_LAMP = """
 [stage]
 driver = "virtual"
 homing_feed_mm_s = 200
@@ -110,6 +98,11 @@ class Stand:
     method: Method[Any]
     apparatus: Apparatus
     paused: threading.Event = field(default_factory=threading.Event)
+    on_pause: Callable[[], None] = lambda: None
+
+    def pauses(self) -> None:
+        self.paused.set()
+        self.on_pause()
 
     def dark(self) -> bool:
         """Whether the projector gives no light now."""
@@ -121,31 +114,29 @@ class Stand:
 @pytest.fixture
 def stand(request: pytest.FixtureRequest) -> Iterator[Stand]:
     given: dict[str, Any] = getattr(request, "param", {})
-    parsed = config.parse(RIG.format(camera=given.get("camera", "")), "test")
-    rig = Rig(parsed, lambda _: None)
-    rig.connect()
-    session, control = rig.take("test"), Control()
-    info = rig.camera.device.info()
-    ring = Ring(given.get("ring", 4), info.shape, info.pixel_format.dtype)
-    tape = Tape(ring, gives=given.get("gives", True))
-    method = method_for(TwoImage(average=3), rig.bench())
-    made: list[Stand] = []
-    apparatus = Apparatus(
-        rig=rig,
-        session=session,
-        control=control,
-        method=method,
-        recorder=cast(Recorder, tape),
-        ring=ring,
-        patience=SequencerSection(),
-        may_go_on=lambda: None,
-        on_pause=lambda _: made[0].paused.set(),
-        taken=0,
-    )
-    made.append(Stand(rig, control, session, tape, method, apparatus))
-    yield made[0]
-    rig.leave(session)
-    rig.close()
+    camera = "noise = false\n" + given.get("camera", "")
+    with small_rig(time_scale=20, camera=camera, more=STAGE_AND_LAMP) as rig:
+        session, control = rig.take("test"), Control()
+        info = rig.camera.device.info()
+        ring = Ring(given.get("ring", 4), info.shape, info.pixel_format.dtype)
+        tape = Tape(ring, gives=given.get("gives", True))
+        method = method_for(TwoImage(average=3), rig.bench())
+        made: list[Stand] = []
+        apparatus = Apparatus(
+            rig=rig,
+            session=session,
+            control=control,
+            method=method,
+            recorder=cast(Recorder, tape),
+            ring=ring,
+            patience=SequencerSection(),
+            may_go_on=lambda: None,
+            on_pause=lambda _: made[0].pauses(),
+            taken=0,
+        )
+        made.append(Stand(rig, control, session, tape, method, apparatus))
+        yield made[0]
+        rig.leave(session)
 
 
 @pytest.fixture
@@ -241,6 +232,36 @@ def test_a_sequence_that_loses_frames_is_run_again_more_slowly(
     assert all(e.frame is not None for e in stand.tape.taken)
 
 
+class Doubter:
+    """In the place of the proof by looks: doubts the frames of these calls."""
+
+    def __init__(self, calls: set[int]) -> None:
+        self.calls, self.asked = calls, list[int]()
+
+    def problem(self, _: Any, step: Expose, __: Any) -> str:
+        self.asked.append(step.index)
+        return "it looks odd" if len(self.asked) in self.calls else ""
+
+
+@pytest.mark.parametrize(
+    ("doubted", "lost"), [({1, 5, 6, 12}, set()), ({2, 3, 4}, {1}), ({12, 13, 14}, {11})]
+)
+def test_a_frame_that_looks_wrong_is_exposed_again_and_so_is_the_next(
+    stand: Stand, doubted: set[int], lost: set[int]
+) -> None:
+    doubter = Doubter(doubted)
+    stand.apparatus.looks = cast(Any, doubter)
+    run(stand, Mode.SOFTWARE)
+    taken = stand.tape.taken
+    assert [(e.index, e.sub) for e in taken] == [(i, s) for i in range(4) for s in range(3)]
+    assert {i for i, e in enumerate(taken) if e.frame is None} == lost
+    assert sum(e.exposing.get("repeated", 0) for e in taken) == len(doubted) - len(lost)
+    assert doubter.asked == sorted(doubter.asked)  # no frame of a later pattern passed for one
+    assert len({e.frame.start_ns for e in taken if e.frame is not None}) == 12 - len(lost)
+    ring = stand.apparatus.ring
+    assert all(ring.take(0) is not None for _ in range(ring.count))  # no buffer is lost
+
+
 @pytest.mark.parametrize("stand", [{"camera": 'faults = ["incomplete-frame@1"]'}], indirect=True)
 def test_each_look_at_the_light_is_a_sign_of_life(stand: Stand) -> None:
     # Ten long ones, each tried again, are more than the watchdog waits for.
@@ -328,12 +349,12 @@ def test_time_in_a_pause_is_not_time_of_the_video(stand: Stand) -> None:
         if frames == 10:
             stand.control.pause("lunch")
 
-    def resume(_: str) -> None:
+    def resume() -> None:
         clock.skipped_ns = round(hour_s * NS)
         stand.control.resume()
 
     stand.tape.on_put = pause
-    stand.apparatus._on_pause = resume
+    stand.on_pause = resume
     watched = watch(stand, 30)
     assert clock.skipped_ns > 0
     assert watched.seconds[-1] < hour_s / 2

@@ -21,7 +21,7 @@ from protocol.errors import Code, ErrorInfo, UmbraError
 from protocol.keys import KeyPair
 from protocol.messages import commands, replies
 from protocol.messages.access import Role
-from protocol.messages.envelopes import PROTOCOL, Event, Preamble, Request, Response
+from protocol.messages.envelopes import JOINED, PROTOCOL, Event, Preamble, Request, Response
 from protocol.messages.events import AnyEvent, RunChanged
 from protocol.messages.findings import Check, Search
 from protocol.messages.rig import RigState, StageState
@@ -57,6 +57,7 @@ class FakeRig:
         self.requests: list[Request] = []
         self.done: list[Request] = []
         self.drop = 0  # answers to swallow
+        self.deaf = False  # to those who ask whether they have joined
         self.copies = 1  # how often each answer is sent
         self.hold_back = 0  # answers to send only together with the next one's
         self.before: list[Frames] = []  # messages to send ahead of the next answer
@@ -183,10 +184,17 @@ class FakeRig:
             if self._ours in ready:
                 self._ours.recv()
                 self._orders.get()()
-            if self._pub in ready and self._pub.recv().startswith(b"\1"):
-                self.subscribed.release()
+            if self._pub in ready:
+                self._subscribed(self._pub.recv())
             if self._router in ready:
                 self._answer(*self._router.recv_multipart())
+
+    def _subscribed(self, message: bytes) -> None:
+        if message.startswith(b"\1" + JOINED.encode()):
+            if not self.deaf:
+                self._pub.send(message[1:])
+        elif message.startswith(b"\1"):
+            self.subscribed.release()
 
     def _answer(self, identity: bytes, header: bytes, *_: bytes) -> None:
         request: Request | None

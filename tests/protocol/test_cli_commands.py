@@ -561,7 +561,7 @@ def test_a_log_that_goes_on() -> None:
 
     class Client:
         @contextmanager
-        def subscribe(self, *topics: str) -> Iterator[Events]:
+        def subscribe(self, *topics: str, joined: bool = True) -> Iterator[Events]:
             assert topics == ("log",)
             yield Events()
 
@@ -583,7 +583,7 @@ def test_a_runs_log_that_goes_on_is_of_that_run() -> None:
 
     class Client:
         @contextmanager
-        def subscribe(self, *topics: str) -> Iterator[Events]:
+        def subscribe(self, *topics: str, joined: bool = True) -> Iterator[Events]:
             yield Events()
 
         def log(self, run: str, limit: int) -> tuple[dict[str, str], ...]:

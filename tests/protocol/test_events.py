@@ -77,7 +77,6 @@ def ended(state: RunState, reason: str = "", code: str = "") -> End:
 
 def test_events_come_in_order_with_their_arrays(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe("queue", "preview") as events:
-        fake.await_subscribers(2)
         fake.publish(QueueChanged(queue=("a",)))
         fake.publish(RigChanged(state=RigState.MANUAL))  # not subscribed to
         fake.publish(QueueChanged(queue=("a", "b")))
@@ -95,9 +94,19 @@ def test_events_come_in_order_with_their_arrays(fake: FakeRig, rig: Client) -> N
     assert list(events) == []  # closed
 
 
+def test_where_no_events_come_it_says_so(fake: FakeRig) -> None:
+    fake.deaf = True
+    with Client(fake.endpoint, timeout_s=0.3) as rig:
+        with pytest.raises(UmbraError, match="no events came from") as caught:
+            rig.subscribe("queue")
+        assert caught.value.code is Code.UNREACHABLE
+        run = rig.scan(Checkerboard())  # followed all the same, by asking
+        fake.change(run.id, state=RunState.DONE, end=ended(RunState.DONE))
+        assert run.wait(10).state is RunState.DONE
+
+
 def test_no_topic_is_all_but_previews(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe() as events:
-        fake.await_subscribers(5)
         fake.publish(PreviewTaken(run="", what="frame"))
         fake.publish(RigChanged(state=RigState.MANUAL))
         assert next(events).event.topic == "rig"
@@ -105,7 +114,6 @@ def test_no_topic_is_all_but_previews(fake: FakeRig, rig: Client) -> None:
 
 def test_a_lost_event_shows_as_a_gap(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe("queue") as events:
-        fake.await_subscribers(1)
         fake.publish(QueueChanged(queue=()))
         fake.publish(QueueChanged(queue=("lost",)), lose=True)
         fake.publish(QueueChanged(queue=("a",)))
@@ -115,7 +123,6 @@ def test_a_lost_event_shows_as_a_gap(fake: FakeRig, rig: Client) -> None:
 
 def test_a_new_epoch_is_a_gap(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe("queue") as events:
-        fake.await_subscribers(1)
         fake.publish(QueueChanged(queue=()))
         fake.order(fake.new_epoch)
         fake.publish(QueueChanged(queue=()))
@@ -125,7 +132,6 @@ def test_a_new_epoch_is_a_gap(fake: FakeRig, rig: Client) -> None:
 
 def test_garbled_events_are_passed_over(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe("queue") as events:
-        fake.await_subscribers(1)
         for garbage in ([b"queue"], [b"queue", b""], [b"queue", b"{}"], [b"queue", b"\xff", b"x"]):
             fake.publish_raw(*garbage)
         fake.publish(QueueChanged(queue=("a",)))
@@ -134,7 +140,6 @@ def test_garbled_events_are_passed_over(fake: FakeRig, rig: Client) -> None:
 
 def test_a_slow_reader_gets_the_newest_preview_and_no_pile(fake: FakeRig, rig: Client) -> None:
     with rig.subscribe("preview", "queue") as events:
-        fake.await_subscribers(2)
         shown = [np.full((2, 2, 3), i, np.uint8) for i in range(PREVIEWS_HWM)]
         for picture in shown:
             fake.publish(PreviewTaken(run="r", what="frame"), {"preview": picture})
@@ -391,7 +396,6 @@ async def test_the_asyncio_client_follows_a_run(
 
 async def test_the_asyncio_client_streams_events(fake: FakeRig) -> None:
     async with AsyncClient(fake.endpoint) as rig, rig.subscribe("queue", "preview") as events:
-        fake.await_subscribers(2)
         fake.publish(QueueChanged(queue=("a",)))
         fake.publish(QueueChanged(queue=()), lose=True)
         fake.publish(QueueChanged(queue=("b",)))
@@ -405,6 +409,14 @@ async def test_the_asyncio_client_streams_events(fake: FakeRig) -> None:
             (QueueChanged(queue=("b",)), True),
         ]
         assert await events.next(0.01) is None
+
+
+async def test_the_asyncio_client_says_where_no_events_come(fake: FakeRig) -> None:
+    fake.deaf = True
+    async with AsyncClient(fake.endpoint, timeout_s=0.3) as rig:
+        with pytest.raises(UmbraError, match="no events came from"):
+            async with rig.subscribe("queue"):
+                pass
 
 
 # ---------------------------------------------------------------- the lock

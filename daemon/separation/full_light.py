@@ -1,6 +1,7 @@
-"""Means of a pixel's samples while a stick is swept: in full light, and in the umbra.
+"""The mean of a pixel's samples in full light, and in the umbra, while an occluder goes by.
 
-In whole counts, and a few operations a frame: a sweep is watched at a video's rate.
+A pixel is in full light for most of a sweep, so that its level there is a mean of many frames. In
+the umbra it may have been once.
 """
 
 from __future__ import annotations
@@ -22,17 +23,24 @@ LIT_DEVIATIONS = 5.0
 PARTED = 2.0 * 2.0**0.5
 """Deviations by which noise parts two samples of one level."""
 
-_LIMITED = 8  # frames after which it is asked again what is lit
-_MOST = 65_535  # samples that are averaged
-_WORTH = 1.25**-2  # of as many others: which ones noise lets in differs (see `plateau.MEMBERS`)
+_WORTH = 1.25**-2
+"""What a sample of many in the umbra is worth of others: which of them noise lets in differs (see
+`plateau.MEMBERS`)."""
+
+_LIMITED = 8
+"""Frames after which it is asked again what is lit."""
+
+_MOST = 65_535
+"""Samples that are averaged: their number is kept in 16 bits."""
 
 
 class FullLight:
     """The mean of a pixel's samples in full light: three planes.
 
-    Lit are those above a limit near the second brightest so far. It is looked at anew now and then:
-    an old one is too high for nothing but noise. Where the brightest have left the mean behind (the
-    first frames had the shadow there) it begins again.
+    A sample counts as lit above a limit that lies a little below the second brightest so far. The
+    limit rises with the brightest samples; it is set anew every few frames only, for an old one
+    lets too many samples pass, not too few. A mean that has come to lie below the limit (the first
+    frames had the shadow there) begins again.
     """
 
     def __init__(self) -> None:
@@ -65,9 +73,8 @@ class FullLight:
         lit."""
         mean = self._sum / np.maximum(self._count, 1).astype(np.float32)
         behind = (self._count == 0) | (mean < _least_lit(edge, darkest, table))
-        return np.where(behind, edge, mean).astype(np.float32), np.where(
-            behind, np.uint16(1), self._count
-        )
+        level = np.where(behind, edge, mean).astype(np.float32)
+        return level, np.where(behind, np.uint16(1), self._count)
 
 
 def _least_lit(edge: NDArray[Any], darkest: NDArray[Any], table: Plane | None) -> NDArray[Any]:
