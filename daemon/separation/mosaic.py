@@ -89,7 +89,7 @@ class Mosaic:
         around /= np.maximum(_around(there, _NEXT) - there, np.float32(1))
         noise = self._there(noise)
         level = np.maximum(np.abs(around), _DARK * noise)
-        np.maximum(level, np.float32(1e-6) * level.max(), out=level)
+        np.maximum(level, np.float32(1e-6) * max(level.max(), np.float32(1)), out=level)
         texture = np.square((values - around) * there)
         texture -= np.float32(1 + 1 / 8) * np.square(noise)
         texture /= np.square(level)
