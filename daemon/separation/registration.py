@@ -9,7 +9,9 @@ there, so that the source's strength does not matter. The place is then known to
 pixel, and no further: what is left of the shadow pulls. From there `placing.Levels` finds the rest,
 and the turn.
 
-The first frames are the reference: they are aligned among themselves once they are all there.
+The first frames are the reference: they are aligned among themselves once they are all there, by
+their correlation first, then round by round with the levels that they make, turns too. An exact
+place that lies nowhere near the correlation's is not believed.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ Warp = tuple[float, float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 
 _WORK = 320  # longer side of the pictures that are compared
-_LEAST_SIDE = 64
+_LEAST_SIDE = 120  # in smaller ones a shift out of reach passed for another
 _FLOOR = 0.03  # of the bright places: added to light, so that the dark ones' noise has no say
 _FOLLOWED = 0.25  # of the differences: only a mesh that was taken for the scene explains so much
 _SOFT = 0.5  # px: finer things interpolation moves by another way
