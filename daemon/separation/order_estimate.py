@@ -76,9 +76,9 @@ class OrderStatistics:
     def _noise(self) -> Noise | None:
         return self._followed.noise(self._followed.light(), self._average)
 
-    def told(self, noise: ScanNoise) -> Told:
-        """What is known of the noise by now."""
-        return noise.told(self._residual or self._noise())
+    def told(self, noise: ScanNoise, *, ordered: bool) -> Told:
+        """What is known of the noise by now; `ordered`: patterns came in their order, if any."""
+        return noise.told(self._residual or self._noise(), ordered=ordered)
 
     def estimate(self, low: Plane, high: Plane, told: Told) -> Estimated:
         """Lit and unlit light of each pixel, from the light (keep, ...) of its darkest and its

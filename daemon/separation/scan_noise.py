@@ -76,14 +76,16 @@ class ScanNoise:
     def _picture(self) -> Noise | None:
         return None if self._pattern is None else self._bounds.of(self._pattern)
 
-    def told(self, residual: Noise | None = None) -> Told:
+    def told(self, residual: Noise | None = None, *, ordered: bool = False) -> Told:
         """What is known by now; `residual`: the noise of one frame in what the light that patterns
-        have in common leaves over (`Followed`).
+        have in common leaves over (`Followed`); `ordered`: they have it, as other signs say.
 
-        A calibration is believed unless the scan's own frames contradict it.
+        A picture shows no less noise than there is, unless files were compressed: that takes noise
+        away where a picture is smooth, and adds error where it has a pattern. A calibration is
+        believed unless the scan's own frames contradict it.
         """
         picture = self._picture
-        if residual is not None and picture is not None and residual.over(picture) > _MORE:
+        if residual and picture and not ordered and residual.over(picture) > _MORE:
             residual = None  # the light has not the order that it was said to have
         for found, source in ((self._repeats.noise(), REPEATS), (residual, RESIDUALS)):
             if found is not None:
