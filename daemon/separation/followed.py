@@ -27,7 +27,7 @@ _RUN = 8  # neighbours in a row, where patterns have no order
 _MATRICES = {True: 1024, False: 384}  # that are looked at, with a grid of shifts and without
 _LEAST = 32  # of them, to say anything
 _DIM = 0.2  # of the brightest pixels' step: with less, a pixel is not looked at
-_SURPLUS = 3.5  # times the variance expected from which a matrix holds more than noise
+_SURPLUS = 3.5  # times the variance expected from which a matrix, or a frame, holds more than noise
 _FLOOR = 0.03  # of a matrix's mean variance, the least that a sample of it has
 _ROUNDS = 4
 _LEVELS = 65
@@ -113,10 +113,10 @@ def _places(shape: tuple[int, ...], run: int, mosaic: bool) -> NDArray[np.intp]:
     return np.asarray((first[:, None] + apart * np.arange(run)).reshape(-1))
 
 
-def _noise(matrices: Double, response: Response, average: int, rank: int | None) -> Noise:
+def _noise(matrices: Double, response: Response, average: int, rank: int | None) -> Noise | None:
     """From what `rank` parts (None: as many as there are) and the rows' means leave of matrices of
     light (n, rows, columns), its variance being linear in light, as of a sensor, and in the square
-    of the slope of the tone curve, as of what comes after it."""
+    of the slope of the tone curve, as of what comes after it. None: it is not noise alone."""
     columns = matrices.shape[2]
     light = matrices - matrices.mean(axis=2, keepdims=True)
     values, vectors = np.linalg.eigh(light @ light.transpose(0, 2, 1))
@@ -128,6 +128,9 @@ def _noise(matrices: Double, response: Response, average: int, rank: int | None)
     across = np.square(left @ left.transpose(0, 2, 1))
     down = np.eye(columns) - 1.0 / columns - along.transpose(0, 2, 1) @ along
     np.square(down, out=down)
+    of_frames = np.square(residual).mean(axis=0)
+    if rank is not None and of_frames.max() > _SURPLUS * np.median(of_frames):
+        return None  # a frame is not of its place: noise is alike in all
     level = matrices - residual
     basis = [np.ones_like(level), level]
     if not response.is_linear:
