@@ -48,7 +48,7 @@ from protocol.wire import MOST_BYTES
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """What ends the daemon in an orderly way: the service manager, Ctrl-C, a terminal that closes."""
 
-_TEND_S = 1.0
+_TEND_S = 1.0  # how often leases, reconnections and unwritten states are looked after
 _SWITCH_S = 0.0005
 """Python's switch interval: commands must not wait 5 ms for a thread that computes."""
 

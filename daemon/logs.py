@@ -19,8 +19,8 @@ import msgspec
 import structlog
 
 RUN_LOG = "log.jsonl"
-_KEPT = 5000
-_RUN_BYTES = 1 << 20
+_KEPT = 5000  # records of the daemon's own, in memory
+_RUN_BYTES = 1 << 20  # of a run's log, at most
 
 
 class LogBook:

@@ -143,17 +143,12 @@ class GentlCamera(SfncCamera):
         found = list(harvester.device_info_list)
         serial = self.options.serial
         wanted = [info for info in found if serial in {"", str(info.serial_number)}]
-        seen = ", ".join(str(info.serial_number) for info in found) or "none"
-        if not wanted:
-            raise DeviceLost(
-                self.name,
-                "connect",
-                f"no camera {serial or 'at all'} (found: {seen})",
-                "check cable, power and `serial`, and close other programs that use its producer",
-            )
-        if len(wanted) > 1:
-            raise self._refused("connect", f"several cameras fit: {seen}", "name one by `serial`")
-        (info,) = wanted
+        info = self._only(
+            wanted,
+            serial,
+            (info.serial_number for info in found),
+            "check cable, power and `serial`, and close other programs that use its producer",
+        )
         self._acquirer = harvester.create(found.index(info))
         self._broken, self._told = _Count(), 0
         self._acquirer.add_callback(ImageAcquirer.Events.INCOMPLETE_BUFFER, self._broken)

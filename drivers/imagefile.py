@@ -7,6 +7,8 @@ OpenCV decodes a truncated file without a word, so a file's structure is checked
 
 Samples are given as they are stored: 8 or 16 bit, never scaled, never rotated by EXIF. An opaque
 alpha channel is dropped; any other is refused, because its pixels were mixed with nothing known.
+A camera's raw file is refused by its name or its tags: most are TIFF, and what a reader of images
+finds in them is a small developed picture for viewing.
 """
 
 from __future__ import annotations
@@ -25,6 +27,16 @@ from numpy.typing import NDArray
 
 SAVE_AS = "save it as 8- or 16-bit grey or RGB PNG or TIFF"
 COPY_AGAIN = "copy or export it again, or take it out of the folder"
+CONVERT = (
+    "convert it to a 16-bit TIFF of the sensor's own counts (dcraw -D -4 -T -t 0) and name the "
+    "mosaic with `bayer`; docs/cameras.md says how"
+)
+
+_RAW_NAME = re.compile(
+    r"\.(3fr|arw|cr[23w]|dcr|dng|erf|fff|iiq|kdc|mef|mos|mrw|nef|nrw|orf|pef|raf|rw[2l]|sr[2fw]|x3f)",
+    re.IGNORECASE,
+)
+"""Suffixes of cameras' raw files."""
 
 
 class BadImage(Exception):
@@ -58,6 +70,8 @@ class ImageHeader:
 
 def inspect(path: Path) -> ImageHeader:
     """A file's header, its structure checked to the end. Raises BadImage."""
+    if _RAW_NAME.fullmatch(path.suffix):
+        raise _raw()
     data = _bytes(path)
     header = _parser(data)(data)
     if header.alpha:
@@ -75,18 +89,25 @@ def decode(data: bytes) -> NDArray[Any]:
     return _decode(data, _parser(data)(data))
 
 
-def is_image(path: Path) -> bool:
-    """Whether a file begins like an image format of this module. Raises OSError."""
-    with path.open("rb") as file:
-        return _known(file.read(16)) is not None
+def head(path: Path, size: int) -> bytes:
+    """The first bytes of a file. Raises BadImage for what cannot be read, or is no file."""
+    return _bytes(path, size)
+
+
+def is_image(data: bytes) -> bool:
+    """Whether a file that begins so is in an image format of this module."""
+    return _known(data) is not None
 
 
 # ---------------------------------------------------------------- reading
 
 
-def _bytes(path: Path) -> bytes:
+def _bytes(path: Path, size: int = -1) -> bytes:
     try:
-        return path.read_bytes()
+        if not path.is_file() and path.exists():  # a pipe would be waited for, a device has no end
+            raise BadImage("is no file", "take it out, or give a folder of files or a video")
+        with path.open("rb") as file:
+            return file.read(size)
     except OSError as error:
         raise BadImage(
             f"cannot be read ({error.strerror})", "check that it is there and its permissions"
@@ -152,6 +173,10 @@ def _truncated() -> BadImage:
     return BadImage("is truncated", COPY_AGAIN)
 
 
+def _raw() -> BadImage:
+    return BadImage("is a camera's raw file", CONVERT)
+
+
 # ---------------------------------------------------------------- formats
 
 
@@ -211,8 +236,14 @@ def _jpeg(data: bytes) -> ImageHeader:
     return header
 
 
+_Tags = dict[int, tuple[int, ...]]
+
+
 def _tiff(data: bytes) -> ImageHeader:
-    pages = [tags for tags in _tiff_pages(data) if not tags.get(254, (0,))[0] & 1]  # no thumbnails
+    every = list(_tiff_pages(data))
+    if data[8:10] == b"CR" or any(map(_is_raw, every)):  # CR2's mark; its mosaic has no tags
+        raise _raw()
+    pages = [tags for tags in every if not tags.get(254, (0,))[0] & 1]  # no thumbnails
     if len(pages) != 1:
         raise BadImage(f"holds {len(pages)} pages", "save one image a file")
     tags = pages[0]
@@ -221,8 +252,6 @@ def _tiff(data: bytes) -> ImageHeader:
         return tags.get(number, (default,))[0]
 
     samples, photometric = tag(277, 1), tag(262, 1)
-    if photometric in {32803, 34892}:
-        raise BadImage("is a camera's raw file (DNG)", "develop it linearly to 16-bit TIFF")
     kinds = set(tags.get(339, (1,)))
     if kinds == {3}:
         raise BadImage(
@@ -252,37 +281,53 @@ def _tiff(data: bytes) -> ImageHeader:
     return header
 
 
+def _is_raw(tags: _Tags) -> bool:
+    """Whether a page is of a camera's raw file: DNGVersion, a mosaic, or DNG's linear raw."""
+    return 50706 in tags or tags.get(262, (0,))[0] in {32803, 34892}
+
+
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}  # the unsigned ones
 
 
-def _tiff_pages(data: bytes) -> Iterator[dict[int, tuple[int, ...]]]:
-    """The integer tags of each page (image file directory), classic TIFF and BigTIFF."""
+def _tiff_pages(data: bytes) -> Iterator[_Tags]:
+    """The integer tags of each page (image file directory), classic TIFF and BigTIFF. A page's
+    further pages (SubIFDs), in which most raw files have the mosaic, are asked for that only."""
     order = "<" if data[:2] == b"II" else ">"
     big = struct.unpack_from(order + "H", data, 2)[0] == 43
-    word, count_code, entry_size = ("Q", "Q", 20) if big else ("I", "H", 12)
-    inline, value_at = (8, 12) if big else (4, 8)
-    (at,) = struct.unpack_from(order + word, data, 8 if big else 4)
+    (at,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
     seen: set[int] = set()
     while at:
         if at in seen:
             raise BadImage("is corrupt: its pages form a loop", COPY_AGAIN)
         seen.add(at)
-        (entries,) = struct.unpack_from(order + count_code, data, at)
-        at += struct.calcsize(order + count_code)
-        tags: dict[int, tuple[int, ...]] = {}
-        for entry in range(at, at + entries * entry_size, entry_size):
-            number, kind, count = struct.unpack_from(f"{order}HH{word}", data, entry)
-            if kind not in _TIFF_TYPES or not count:
-                continue
-            code = _TIFF_TYPES[kind]
-            value = entry + value_at
-            if count * struct.calcsize(code) > inline:
-                (value,) = struct.unpack_from(order + word, data, value)
-            if count * struct.calcsize(code) > len(data) - value:
-                raise _truncated()
-            tags[number] = struct.unpack_from(f"{order}{count}{code}", data, value)
+        tags, at = _tiff_directory(data, at, order, big)
+        for below in tags.get(330, ()):
+            if _is_raw(_tiff_directory(data, below, order, big)[0]):
+                raise _raw()
         yield tags
-        (at,) = struct.unpack_from(order + word, data, at + entries * entry_size)
+
+
+def _tiff_directory(data: bytes, at: int, order: str, big: bool) -> tuple[_Tags, int]:
+    """The integer tags of the directory at an offset, and the next one's offset, 0 after the
+    last."""
+    word, count_code, entry_size = ("Q", "Q", 20) if big else ("I", "H", 12)
+    inline, value_at = (8, 12) if big else (4, 8)
+    (entries,) = struct.unpack_from(order + count_code, data, at)
+    at += struct.calcsize(order + count_code)
+    tags: _Tags = {}
+    for entry in range(at, at + entries * entry_size, entry_size):
+        number, kind, count = struct.unpack_from(f"{order}HH{word}", data, entry)
+        if kind not in _TIFF_TYPES or not count:
+            continue
+        code = _TIFF_TYPES[kind]
+        value = entry + value_at
+        if count * struct.calcsize(code) > inline:
+            (value,) = struct.unpack_from(order + word, data, value)
+        if count * struct.calcsize(code) > len(data) - value:
+            raise _truncated()
+        tags[number] = struct.unpack_from(f"{order}{count}{code}", data, value)
+    (after,) = struct.unpack_from(order + word, data, at + entries * entry_size)
+    return tags, after
 
 
 def _bmp(data: bytes) -> ImageHeader:

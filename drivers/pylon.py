@@ -110,17 +110,12 @@ class PylonCamera(SfncCamera):
             if (not options.serial or info.GetSerialNumber() == options.serial)
             and (not options.user_id or info.GetUserDefinedName() == options.user_id)
         ]
-        seen = ", ".join(str(info.GetSerialNumber()) for info in found) or "none"
-        if not wanted:
-            raise DeviceLost(
-                self.name,
-                "connect",
-                f"no camera {options.serial or options.user_id or 'at all'} (found: {seen})",
-                "check cable and power, and `serial`",
-            )
-        if len(wanted) > 1:
-            raise self._refused("connect", f"several cameras fit: {seen}", "name one by `serial`")
-        (info,) = wanted
+        info = self._only(
+            wanted,
+            options.serial or options.user_id,
+            (info.GetSerialNumber() for info in found),
+            "check cable and power, and `serial`",
+        )
         self._camera = pylon.InstantCamera(_transport(info).CreateDevice(info))
         self._camera.Open()
         identity = Identity(

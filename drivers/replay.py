@@ -1,9 +1,9 @@
 """A camera over a folder of images or a video file: scans of yesterday, photographs of others.
 
 `connect` looks at every file before the first frame is given, so that bad input is refused before
-a scan begins; each refusal names the file and what to do. Frames come in the natural order of
-their names (frame2 before frame10) after those of `first`, as fast as they can be read; their
-times are made up: frame k begins k / rate after `start(..., at=0)` would have.
+a scan begins (`drivers.recording`); each refusal names the file and what to do. Frames come as fast
+as they can be read; their times are made up: frame k begins k / rate after `start(..., at=0)` would
+have.
 
 Every command may be sent again. `start(..., at=k)` gives frame k next, also of a video, where the
 frames before it are decoded and dropped: a seek by time would not be exact.
@@ -11,21 +11,17 @@ frames before it are decoded and dropped: a seek by time would not be exact.
 
 from __future__ import annotations
 
-import fnmatch
-import re
 import threading
-from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeout
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import imagefile, videofile
+from drivers import imagefile
 from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
 from drivers.base.device import Context, Identity, Options
 from drivers.base.errors import (
@@ -38,12 +34,11 @@ from drivers.base.errors import (
 )
 from drivers.base.pixelformat import PixelFormat
 from drivers.clock import NS
-from drivers.imagefile import BadImage, ImageHeader
+from drivers.imagefile import BadImage
+from drivers.recording import BadRecording, Recording, find
 from drivers.videofile import VideoFile
 
 T = TypeVar("T")
-
-DROPPINGS = frozenset({"thumbs.db", "ehthumbs.db", "desktop.ini"})  # and all that begins with "."
 
 
 class ReplayOptions(Options, frozen=True, kw_only=True):
@@ -60,27 +55,6 @@ class ReplayOptions(Options, frozen=True, kw_only=True):
     rate_hz: float | None = None  # default: a video's own, 30 for images
 
 
-def natural_key(name: str) -> tuple[tuple[str | int, ...], str]:
-    """Sorts names as people number them: numbers by value, the rest without regard to case."""
-    parts = re.split(r"([0-9]+)", name.casefold())
-    return tuple(int(part) if i % 2 else part for i, part in enumerate(parts)), name
-
-
-@dataclass(frozen=True, slots=True)
-class _Recording:
-    """What `connect` found: images given first, then the folder's images or the video's frames."""
-
-    images: tuple[Path, ...]
-    video: Path | None
-    video_frames: int
-    layout: ImageHeader
-    rate_hz: float
-
-    @property
-    def frames(self) -> int:
-        return len(self.images) + self.video_frames
-
-
 _Read = tuple[NDArray[Any] | None, str]  # pixels (None: the end), the name of their source
 
 
@@ -94,7 +68,7 @@ class ReplayCamera(Camera):
     def __init__(self, name: str, options: ReplayOptions, context: Context) -> None:
         super().__init__(name, options, context)
         self._halted = threading.Event()
-        self._recording: _Recording | None = None
+        self._recording: Recording | None = None
         self._info: CameraInfo | None = None
         self._reader: ThreadPoolExecutor | None = None
         self._ahead: Future[_Read] | None = None
@@ -108,26 +82,22 @@ class ReplayCamera(Camera):
     def connect(self) -> Identity:
         """List and check every file. Raises DeviceRefused naming the first that will not do."""
         self.close()
-        root = Path(self.options.path).expanduser()
-        if not root.exists():
-            raise self._refused("connect", f"{root} is not there", "check `path`")
-        folder = root if root.is_dir() else root.parent
-        first = tuple(folder / Path(name).expanduser() for name in self.options.first)
-        video = None if root.is_dir() else root
-        images = first if video else first + self._listing(root, first)
-        headers = {path: self._at(path, "connect", imagefile.inspect) for path in images}
-        frames, rate = 0, videofile.DEFAULT_RATE_HZ
-        if video:
-            grey = bool(self.options.bayer)  # a mosaic is stored as grey video
-            headers[video], frames, rate = self._at(
-                video, "connect", lambda path: videofile.inspect(path, grey=grey)
+        options, root = self.options, Path(self.options.path).expanduser()
+        try:
+            recording = find(
+                root,
+                first=options.first,
+                match=options.match,
+                grey=bool(options.bayer),  # a mosaic is stored as grey video
+                rate_hz=options.rate_hz,
             )
-        layout = self._same_layout(headers)
-        recording = _Recording(images, video, frames, layout, self.options.rate_hz or rate)
+        except BadRecording as error:
+            raise self._refused("connect", error.problem, error.remedy) from error
         self._info = self._describe(recording)
         self._recording = recording
-        if images:
-            self._read_image(images[-1], "connect")  # a wrong `bits` shows now, not in mid-scan
+        if recording.images:
+            # A wrong `bits` shows now, not in mid-scan.
+            self._read_image(recording.images[-1], "connect")
         return Identity(model=f"replay of {root.name}", serial=str(root.resolve()))
 
     def check(self) -> None:
@@ -257,47 +227,7 @@ class ReplayCamera(Camera):
             self._video.close()
             self._video = None
 
-    # ------------------------------------------------------------ finding the files
-
-    def _listing(self, folder: Path, first: tuple[Path, ...]) -> tuple[Path, ...]:
-        apart = {path.resolve() for path in first}
-        try:
-            entries = sorted(folder.iterdir(), key=lambda path: natural_key(path.name))
-        except OSError as error:
-            raise self._refused(
-                "connect", f"{folder} cannot be listed ({error.strerror})", "check its permissions"
-            ) from error
-        seen = [path for path in entries if not _is_dropping(path.name)]
-        files = tuple(
-            path
-            for path in seen
-            if not path.is_dir()
-            and fnmatch.fnmatchcase(path.name, self.options.match)
-            and path.resolve() not in apart
-        )
-        if not files:
-            folders = ", ".join(path.name for path in seen if path.is_dir())
-            matching = "" if self.options.match == "*" else f" that match {self.options.match!r}"
-            raise self._refused(
-                "connect",
-                f"{folder} has no images{matching}",
-                f"give one of its folders ({folders})" if folders else "check `path` and `match`",
-            )
-        return files
-
-    def _same_layout(self, headers: dict[Path, ImageHeader]) -> ImageHeader:
-        usual, _ = Counter(header.layout for header in headers.values()).most_common(1)[0]
-        like, right = next((p.name, h) for p, h in headers.items() if h.layout == usual)
-        for path, header in headers.items():
-            if header.layout != usual:
-                raise self._refused(
-                    "connect",
-                    f"{path.name} is {header}, {like} is {right}",
-                    "all frames must be alike: take it out, or choose the others with `match`",
-                )
-        return right
-
-    def _describe(self, recording: _Recording) -> CameraInfo:
+    def _describe(self, recording: Recording) -> CameraInfo:
         layout, options = recording.layout, self.options
         bits = options.bits or layout.bits
         if (layout.bits == 8) != (bits == 8):
@@ -355,11 +285,12 @@ class ReplayCamera(Camera):
             return self._read_image(path, "grab"), path.name
         if recording.video is None:
             return None, ""
-        if self._video is None:
-            self._video = self._at(recording.video, "grab", VideoFile)
-            self._video.skip(index - len(recording.images))
-        number = self._video.next
-        image = self._video.read()
+        video = self._video
+        if video is None:
+            video = self._video = self._at(recording.video, "grab", VideoFile)
+            video.skip(index - len(recording.images))
+        number = video.next
+        image = self._at(recording.video, "grab", lambda _: video.read())
         if image is None:
             return None, ""
         return self._fit(image, recording.video, "grab"), f"{recording.video.name}#{number}"
@@ -402,14 +333,10 @@ class ReplayCamera(Camera):
             kind: type[DeviceError] = DeviceRefused if phase == "connect" else DeviceGarbled
             raise kind(self.name, phase, f"{path.name} {error.problem}", error.remedy) from error
 
-    def _connected(self, phase: str) -> _Recording:
+    def _connected(self, phase: str) -> Recording:
         if self._recording is None:
             raise self._refused(phase, "not connected", "connect it first")
         return self._recording
 
     def _refused(self, phase: str, problem: str, remedy: str) -> DeviceRefused:
         return DeviceRefused(self.name, phase, problem, remedy)
-
-
-def _is_dropping(name: str) -> bool:
-    return name.startswith(".") or name.casefold() in DROPPINGS

@@ -13,9 +13,9 @@ the next trigger, so that a late frame is never taken for the next one.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,15 @@ from numpy.typing import NDArray
 from drivers.attached import AttachedCamera
 from drivers.base.camera import Acquisition, CameraInfo, CameraSettings, Frame
 from drivers.base.device import Context, Options
-from drivers.base.errors import DeviceGarbled, DeviceTimeout
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceTimeout
 from drivers.clock import NS
 from drivers.devicetime import DeviceTime
 from drivers.unpack import Layout, unpack
 
 WRAP = 65535  # GigE Vision's frame ids go from 1 to this
 HALT_SLICE_S = 0.02  # a wait inside a library cannot be woken: so long is it until `halt` is seen
+
+T = TypeVar("T")
 
 
 class StreamingOptions(Options, frozen=True, kw_only=True):
@@ -111,6 +113,20 @@ class StreamingCamera(AttachedCamera):
 
     def _still_there(self, phase: str) -> None:
         """Raise DeviceLost if no frame came because there is no camera any more."""
+
+    def _only(self, fitting: Sequence[T], asked: str, serials: Iterable[object], remedy: str) -> T:
+        """The one camera that fits what was `asked` for, of those with these serial numbers.
+
+        Raises DeviceLost where there is none, DeviceRefused where there are several.
+        """
+        seen = ", ".join(map(str, serials)) or "none"
+        if not fitting:
+            raise DeviceLost(
+                self.name, "connect", f"no camera {asked or 'at all'} (found: {seen})", remedy
+            )
+        if len(fitting) > 1:
+            raise self._refused("connect", f"several cameras fit: {seen}", "name one by `serial`")
+        return fitting[0]
 
     # ------------------------------------------------------------ what it is and is set to
 

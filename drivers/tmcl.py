@@ -1,8 +1,7 @@
 """A Trinamic TMCL module that turns an eccentric: one stepper, whose rotation is the mesh's circle.
 
-The occluder hangs on a pin at radius r of the motor's shaft, on a parallel guide, so that angle θ
-puts it at centre + r (cos θ, sin θ). It can be nowhere else: `move` takes points of that circle,
-and `circle` only that circle.
+The occluder hangs on a pin of the motor's shaft (tmcl_eccentric.py) and can be nowhere but on its
+circle: `move` takes points of that circle, and `circle` only that circle.
 
 A position read after a reconnect means nothing (the module may have lost its supply, or the shaft
 been turned): homed first. What the line does about damaged, late and missing answers is said in
@@ -22,12 +21,13 @@ from drivers.base.device import Context, Identity, Options
 from drivers.base.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.base.stage import Stage, StageInfo, StageState, StageStatus
 from drivers.clock import NS
+from drivers.limits import NEAR_MM, Limits
 from drivers.serialport import SerialPort, attached
+from drivers.tmcl_eccentric import Eccentric
 from drivers.tmcl_line import TmclLine
 from drivers.tmcl_protocol import Axis, Command, signed
 from drivers.track import Arc, Point, Track
 
-NEAR_MM = 0.05  # a target this near to the circle is on it
 POLL_S = 0.02
 STALL_S = 1.0  # a motor that was told to turn has begun by then
 
@@ -81,8 +81,7 @@ class TmclStage(Stage):
         self._line.on_lost = self._position_lost
         self._arc = Arc(options.centre_mm, options.radius_mm)
         self._track = Track()
-        self._identity: Identity | None = None
-        self._turn = 0  # microsteps a turn
+        self._known: Eccentric | None = None  # once the module's resolution is
         self._pps_unit = 1.0  # microsteps a second in one of the module's units of speed
         self._homed = False
         self._homing = False
@@ -107,7 +106,12 @@ class TmclStage(Stage):
         try:
             identity = self._identify()
             self._line.ask(Command.STOP, phase="connect")
-            self._turn = self.options.steps_per_turn << self._line.get(Axis.MICROSTEPS, "connect")
+            turn = self.options.steps_per_turn << self._line.get(Axis.MICROSTEPS, "connect")
+            self._known = Eccentric(
+                self._arc,
+                -turn if self.options.reverse else turn,
+                math.radians(self.options.home_angle_deg),
+            )
             self._pps_unit = 1.0
             if self.options.velocity_unit == "internal":
                 divisor = self._line.get(Axis.PULSE_DIVISOR, "connect")
@@ -115,7 +119,6 @@ class TmclStage(Stage):
         except DeviceError:
             self.close()
             raise
-        self._identity = identity
         return identity
 
     def _identify(self) -> Identity:
@@ -129,20 +132,7 @@ class TmclStage(Stage):
                 "correct `port`, `address` or `identity`",
             )
         usb = self._line.port.identity
-        identity = Identity(f"TMCM-{model}", usb.serial if usb else "", version)
-        before = self._identity
-        if before is not None and (before.model, before.serial) != (
-            identity.model,
-            identity.serial,
-        ):
-            raise DeviceRefused(
-                self.name,
-                "connect",
-                f"another module ({identity.model} {identity.serial}) has come back in the place "
-                f"of {before.model} {before.serial}",
-                "restore the cabling, or restart the daemon if it was exchanged on purpose",
-            )
-        return identity
+        return Identity(f"TMCM-{model}", usb.serial if usb else "", version)
 
     def check(self) -> None:
         """One read of the position."""
@@ -180,7 +170,7 @@ class TmclStage(Stage):
             "port": self._line.port.path or self.options.port,
             "homed": self._homed,
             "radius_mm": self.options.radius_mm,
-            "microsteps_per_turn": self._turn,
+            "microsteps_per_turn": abs(self._known.turn) if self._known else 0,
             "damaged_frames": self._line.damaged,
         }
 
@@ -188,11 +178,15 @@ class TmclStage(Stage):
 
     def info(self) -> StageInfo:
         """See Stage: the circle's bounding box."""
-        if not self._turn:
-            raise DeviceLost(self.name, "info", "it is not connected", "reconnect it")
+        self._eccentric()
         (x, y), r = self.options.centre_mm, self.options.radius_mm
         travel = ((x - r, x + r), (y - r, y + r))
         return StageInfo(travel, self.options.max_feed_mm_s, only_circle_mm=((x, y), r))
+
+    def _eccentric(self) -> Eccentric:
+        if self._known is None:
+            raise DeviceLost(self.name, "info", "it is not connected", "reconnect it")
+        return self._known
 
     def status(self) -> StageStatus:
         """See Stage."""
@@ -225,9 +219,10 @@ class TmclStage(Stage):
             return StageStatus(
                 StageState.UNKNOWN, None, at_ns, "its position is not known: home it"
             )
-        point = self._arc.point(self._angle())
+        eccentric = self._eccentric()
+        point = eccentric.point(self._position)
         self._track.add(
-            at_ns, point, speed=self._sign() * rate * self._mm(), arc=self._arc, at_rest=at_rest
+            at_ns, point, speed=rate * eccentric.step_mm, arc=self._arc, at_rest=at_rest
         )
         if not at_rest:
             state = StageState.MOVING
@@ -250,18 +245,6 @@ class TmclStage(Stage):
                 "a limit switch, or the driver's own protection: check both, then `umbra stage "
                 "home`",
             )
-
-    def _sign(self) -> int:
-        return -1 if self.options.reverse else 1
-
-    def _mm(self) -> float:
-        """Path of one microstep, mm."""
-        return math.tau * self.options.radius_mm / self._turn
-
-    def _angle(self) -> float:
-        """rad; unwrapped."""
-        turned = self._sign() * self._position / self._turn * math.tau
-        return turned + math.radians(self.options.home_angle_deg)
 
     def position_at(self, at_ns: int) -> Point | None:
         """See Stage. Evenly in angle between the reads: error as in drivers/track.py."""
@@ -331,57 +314,36 @@ class TmclStage(Stage):
     def move(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
         """See Stage: the shorter way round to a point of the circle. Safe to send again."""
         self._line.begin("move")
-        speed = self._speed("move", feed_mm_s)
-        (x, y), r = self.options.centre_mm, self.options.radius_mm
-        off = abs(math.hypot(x_mm - x, y_mm - y) - r)
+        speed, eccentric = self._speed("move", feed_mm_s), self._eccentric()
+        off = eccentric.off((x_mm, y_mm))
         if not off <= NEAR_MM:
-            near = self._arc.point(self._arc.angle((x_mm, y_mm)))
+            (x, y), near = self._arc.centre, eccentric.nearest((x_mm, y_mm))
             raise DeviceRefused(
                 self.name,
                 "move",
-                f"({x_mm:g}, {y_mm:g}) is {off:.3f} mm off the eccentric's circle of {r:g} mm "
-                f"about ({x:g}, {y:g})",
+                f"({x_mm:g}, {y_mm:g}) is {off:.3f} mm off the eccentric's circle of "
+                f"{self._arc.radius:g} mm about ({x:g}, {y:g})",
                 f"the nearest point is ({near[0]:.3f}, {near[1]:.3f})",
             )
         self._ready("move")
-        way = math.remainder(self._arc.angle((x_mm, y_mm)) - self._angle(), math.tau)
-        self._go(way, speed, "move")
+        self._go(eccentric.to_point((x_mm, y_mm), self._position), speed, "move")
 
     def circle(self, centre_mm: Point, radius_mm: float, feed_mm_s: float, turns: float) -> None:
         """See Stage: only the eccentric's own circle. Safe to send again. `turns` may be inf."""
         self._line.begin("circle")
         speed = self._speed("circle", feed_mm_s)
-        (x, y), r = self.options.centre_mm, self.options.radius_mm
-        if not (abs(radius_mm - r) <= NEAR_MM and math.dist(centre_mm, (x, y)) <= NEAR_MM):
-            raise DeviceRefused(
-                self.name,
-                "circle",
-                f"a circle of {radius_mm:g} mm about ({centre_mm[0]:g}, {centre_mm[1]:g})",
-                f"the eccentric goes round {r:g} mm about ({x:g}, {y:g}) only",
-            )
-        if not turns > 0:
-            raise DeviceRefused(self.name, "circle", f"{turns} turns were asked", "above 0")
+        limits = Limits(self.name, self.info())
+        limits.check_circle("circle", Arc(centre_mm, radius_mm), turns)
         self._ready("circle")
         if math.isinf(turns):
-            self._run(_Motion(None, speed * self._sign()), "circle")
-            return
-        to_start = -self._angle() % math.tau
-        if math.tau - to_start < self._near_rad():
-            to_start = 0.0
-        self._go(to_start + turns * math.tau, speed, "circle")
-
-    def _near_rad(self) -> float:
-        return NEAR_MM / self.options.radius_mm
+            self._run(_Motion(None, -speed if self.options.reverse else speed), "circle")
+        else:
+            self._go(self._eccentric().around(turns, self._position), speed, "circle")
 
     def _speed(self, phase: str, feed: float) -> int:
-        limit = self.options.max_feed_mm_s
-        if not 0 < feed <= limit:
-            raise DeviceRefused(
-                self.name, phase, f"a feed of {feed:g} mm/s", f"it takes up to {limit:g} mm/s"
-            )
-        if not self._turn:
-            return 1  # not connected: `_ready` says so
-        return max(1, round(feed / self._mm() / self._pps_unit))
+        """In the module's units. Raises DeviceRefused."""
+        Limits(self.name, self.info()).check_feed(phase, feed)
+        return max(1, round(feed / abs(self._eccentric().step_mm) / self._pps_unit))
 
     def _ready(self, phase: str) -> None:
         if not self._homed:
@@ -393,8 +355,7 @@ class TmclStage(Stage):
         self._held = False
         self._read(phase)
 
-    def _go(self, way_rad: float, speed: int, phase: str) -> None:
-        steps = round(self._sign() * way_rad / math.tau * self._turn)
+    def _go(self, steps: int, speed: int, phase: str) -> None:
         if abs(steps) >= 2**31:
             raise DeviceRefused(
                 self.name, phase, "more turns than the module counts", "ask for endless turns"

@@ -18,7 +18,7 @@ DEFAULT_RATE_HZ = 30.0
 class VideoFile:
     """A video file, read from its beginning; frames (H, W, 3) uint8 RGB as stored, unrotated.
 
-    Raises BadImage for what is no video that can be read.
+    Raises BadImage for what is no video that can be read, and `read` for a frame that cannot.
     """
 
     def __init__(self, path: Path) -> None:
@@ -59,8 +59,15 @@ class VideoFile:
         there, image = self._capture.read()
         if not there:
             return None
+        try:
+            colour = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        except cv2.error as error:
+            raise BadImage(
+                f"has a frame {self.next} that is no colour picture: {image.shape} {image.dtype}",
+                "convert it to 8-bit colour",
+            ) from error
         self.next += 1
-        return cast(NDArray[np.uint8], cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        return cast(NDArray[np.uint8], colour)
 
     def close(self) -> None:
         """Let go of the file."""
@@ -78,13 +85,9 @@ def inspect(path: Path, *, grey: bool) -> tuple[ImageHeader, int, float]:
 
     `grey`: its colours are alike, and one of them is meant. Raises BadImage.
     """
-    try:
-        if imagefile.is_image(path):
-            raise BadImage("is one image, not a video", "give its folder")
-        with path.open("rb") as file:
-            head = file.read(4096)
-    except OSError as error:
-        raise BadImage(f"cannot be read ({error.strerror})", "check its permissions") from error
+    head = imagefile.head(path, 4096)
+    if imagefile.is_image(head):
+        raise BadImage("is one image, not a video", "give its folder")
     if b"\0" not in head and not head.startswith(b"YUV4MPEG2"):
         # FFmpeg plays text files as terminal art.
         raise BadImage("is neither a folder nor a video", "give a folder or a video file")

@@ -1,22 +1,15 @@
 """Writes docs/protocol.md from the structs: ``python -m protocol.reference > docs/protocol.md``.
 
-What is said of a field is the comment beside it in the source, so there is one place to keep true.
+The page is put together here; `protocol.tables` puts structs and enums into words.
 """
 
 from __future__ import annotations
 
-import ast
-import enum
-import functools
-import inspect
-import re
 import sys
-from collections.abc import Iterable, Iterator
-from typing import Any, get_args
+from collections.abc import Iterable
+from typing import get_args
 
-import msgspec
-from msgspec import inspect as mi
-
+from protocol import tables
 from protocol.connection import ATTEMPTS, EVENTS_HWM, PREVIEWS_HWM
 from protocol.errors import Code, ErrorInfo
 from protocol.following import SILENCE_S
@@ -27,7 +20,7 @@ from protocol.messages.events import AnyEvent
 from protocol.messages.findings import Check, Found, Outcome, Search
 from protocol.messages.rig import CameraSettings, DeviceInfo, Health, LockInfo, RigState, StageState
 from protocol.messages.runs import End, Product, Progress, RunInfo, RunState, Waiting
-from protocol.patterns import AnyBinary, AnyPattern, Axis
+from protocol.patterns import AnyPattern, Axis
 from protocol.scans.anyscan import AnyScan
 from protocol.scans.occluded import Grid
 from protocol.scans.spec import Radiometry, Ready, Reference
@@ -67,80 +60,8 @@ direct = ask({"type": "result", "run": run["id"]})[1]["direct"]
 print(run["state"], direct.shape, "brightest", max(memoryview(direct.tobytes()).cast("f")))
 """
 
-Struct = type[msgspec.Struct]
-
-# ---------------------------------------------------------------- types in words
-
-
-def _limits(kind: Any) -> str:
-    said = []
-    for name, sign in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<")):
-        if (limit := getattr(kind, name, None)) is not None:
-            said.append(f"{sign} {limit:g}" if limit < 1e6 else f"{sign} {limit}")
-    low, high = getattr(kind, "min_length", None), getattr(kind, "max_length", None)
-    if low is not None or high is not None:
-        said.append(f"{low or 0} to {'any' if high is None else high} long")
-    if pattern := getattr(kind, "pattern", None):
-        said.append(f"matching `{pattern}`".replace("|", "\\|"))
-    return f" {', '.join(said)}" if said else ""
-
-
-_PLAIN = {
-    mi.BoolType: "true or false",
-    mi.NoneType: "null",
-    mi.AnyType: "any value",
-    mi.StrType: "text",
-    mi.IntType: "integer",
-    mi.FloatType: "number",
-}
-
-
-def _type(kind: mi.Type) -> str:  # noqa: PLR0911  (one case a kind of type)
-    """A type as the tables name it."""
-    match kind:
-        case mi.Metadata(type=inner):
-            return _type(inner)
-        case mi.UnionType(types=types):
-            structs = [t for t in types if isinstance(t, mi.StructType)]
-            if len(structs) > 1:
-                return _union(structs) + (" or null" if len(types) > len(structs) else "")
-            return " or ".join(map(_type, types))
-        case mi.StructType(cls=cls):
-            return _link(cls)
-        case mi.EnumType(cls=cls):
-            return _link(cls)
-        case mi.LiteralType(values=values):
-            return " or ".join(f'`"{v}"`' for v in values)
-        case mi.VarTupleType(item_type=item):
-            return f"list of {_type(item)}"
-        case mi.TupleType(item_types=items):
-            return f"list of {len(items)}: {', '.join(map(_type, items))}"
-        case mi.DictType(value_type=value):
-            return f"object of {_type(value)}s" if type(value) is not mi.AnyType else "object"
-        case _:
-            return _PLAIN[type(kind)] + _limits(kind)
-
-
-_UNIONS = {
-    "any command": commands.AnyCommand,
-    "any reply": replies.AnyReply,
-    "any event": AnyEvent,
-    "any scan": AnyScan,
-    "any pattern": AnyPattern,
-    "a two-valued pattern": AnyBinary,
-}
-_SECTIONS = {
-    "any command": "commands",
-    "any reply": "replies",
-    "any event": "events",
-    "any scan": "scans",
-    "any pattern": "patterns",
-    "a two-valued pattern": "patterns",
-}
-
-
 _STATES = (RunState, RigState, Health, StageState, Outcome, Role)
-_FACTS: tuple[Struct, ...] = (
+_FACTS: tuple[tables.Struct, ...] = (
     DeviceInfo,
     Product,
     End,
@@ -158,146 +79,6 @@ _FACTS: tuple[Struct, ...] = (
 )
 """What is in others and has no section of its own."""
 _CHOICES = (Reference, Grid, Axis)
-
-
-def _union(structs: list[mi.StructType]) -> str:
-    members = {s.cls for s in structs}
-    [name] = [name for name, union in _UNIONS.items() if set(get_args(union)) == members]
-    return f"[{name}](#{_SECTIONS[name]})"
-
-
-def _link(cls: type) -> str:
-    return f"[{cls.__name__}](#{_anchor(_title(cls))})"
-
-
-def _tag(cls: type) -> str:
-    config = getattr(cls, "__struct_config__", None)
-    return str(config.tag) if config and config.tag else ""
-
-
-def _title(cls: type) -> str:
-    """A heading; the same tag may name a command and its reply, so those say which they are."""
-    if not _tag(cls):
-        return cls.__name__
-    return f"{cls.__name__}: `{_tag(cls)}`"
-
-
-def _anchor(title: str) -> str:
-    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
-
-
-# ---------------------------------------------------------------- comments in the source
-
-
-@functools.cache
-def _source(module: str) -> tuple[list[str], dict[str, ast.ClassDef]]:
-    """A module's lines and classes."""
-    text = inspect.getsource(sys.modules[module])
-    classes = {n.name: n for n in ast.parse(text).body if isinstance(n, ast.ClassDef)}
-    return text.splitlines(), classes
-
-
-def _remarks(cls: type) -> dict[str, str]:
-    """Field or member -> the comment beside it or, with ``#:``, above it; base classes too."""
-    found: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        if not base.__module__.startswith("protocol"):
-            continue
-        lines, classes = _source(base.__module__)
-        for item in classes[base.__name__].body:
-            match item:
-                case ast.AnnAssign(target=ast.Name(id=name)):
-                    pass
-                case ast.Assign(targets=[ast.Name(id=name)]):
-                    pass
-                case _:
-                    continue
-            beside = lines[(item.end_lineno or item.lineno) - 1].partition("  # ")[2]
-            above = lines[item.lineno - 2].strip()
-            found[name] = beside or (above[2:].strip() if above.startswith("#:") else "")
-    return found
-
-
-def _doc(cls: type) -> str:
-    text = inspect.cleandoc(cls.__doc__ or "")
-    return re.sub(r"``(.+?)``", r"`\1`", text)
-
-
-# ---------------------------------------------------------------- tables
-
-
-def _described(kind: mi.Type) -> str:
-    """What the type itself says of the field (Meta's description)."""
-    match kind:
-        case mi.Metadata(type=inner, extra_json_schema=schema):
-            return str((schema or {}).get("description", "")) or _described(inner)
-        case mi.UnionType(types=types):
-            return next(filter(None, map(_described, types)), "")
-        case _:
-            return ""
-
-
-def _default(field: mi.Field) -> str:
-    if field.required:
-        return "required"
-    value = field.default
-    if value is msgspec.NODEFAULT:
-        value = field.default_factory()
-    return f"`{msgspec.json.encode(value).decode()}`"
-
-
-def _field_table(cls: Struct) -> Iterator[str]:
-    info = mi.type_info(cls)
-    assert isinstance(info, mi.StructType)
-    remarks = _remarks(cls)
-    if not info.fields:
-        yield "No fields."
-        return
-    yield "| field | type | default | |"
-    yield "| --- | --- | --- | --- |"
-    for field in info.fields:
-        said = (_described(field.type), remarks.get(field.name, ""))
-        remark = "; ".join(filter(None, said)).replace("None:", "`null`:")
-        yield f"| `{field.encode_name}` | {_type(field.type)} | {_default(field)} | {remark} |"
-
-
-def _members(cls: type[enum.StrEnum]) -> Iterator[str]:
-    remarks = _remarks(cls)
-    yield "| value | |"
-    yield "| --- | --- |"
-    for member in cls:
-        yield f"| `{member.value}` | {remarks.get(member.name, '')} |"
-
-
-def _struct(cls: Struct, extra: str = "") -> Iterator[str]:
-    yield f"### {_title(cls)}"
-    yield ""
-    yield _doc(cls)
-    if extra:
-        yield ""
-        yield extra
-    yield ""
-    yield from _field_table(cls)
-    yield ""
-
-
-def _structs(union: Any) -> Iterator[str]:
-    for cls in get_args(union):
-        yield from _struct(cls)
-
-
-def _enum(cls: type[enum.StrEnum]) -> Iterator[str]:
-    yield f"### {_title(cls)}"
-    yield ""
-    doc = _doc(cls)
-    if "──>" in doc:
-        first, _, rest = doc.partition("\n\n")
-        yield f"{first}\n\n```\n{rest}\n```"
-    else:
-        yield doc
-    yield ""
-    yield from _members(cls)
-    yield ""
 
 
 # ---------------------------------------------------------------- the page
@@ -350,10 +131,10 @@ delimiter frame. Unknown fields and values out of range are refused with the pat
 ```
 
 """
-    yield from _struct(Request)
-    yield from _struct(Response)
-    yield from _struct(ArrayHeader)
-    yield from _struct(Event)
+    yield from tables.struct(Request)
+    yield from tables.struct(Response)
+    yield from tables.struct(ArrayHeader)
+    yield from tables.struct(Event)
     yield f"""\
 ## Requests
 
@@ -381,35 +162,35 @@ their own {PREVIEWS_HWM} previews; they ask when they have heard nothing for {SI
 
 """
     for states in _STATES:
-        yield from _enum(states)
+        yield from tables.choices(states)
     yield "## Commands\n"
     yield "| command | least role | answer | |"
     yield "| --- | --- | --- | --- |"
     for command, reply in replies.ANSWERS.items():
-        first = _doc(command).partition("\n")[0]
-        name = f"[`{_tag(command)}`](#{_anchor(_title(command))})"
-        yield f"| {name} | {command.role.value} | {_link(reply)} | {first} |"
+        name, answer = tables.tag_link(command), tables.link(reply)
+        yield f"| {name} | {command.role.value} | {answer} | {tables.summary(command)} |"
     yield ""
     yield "Each has a field `type`, its name.\n"
     for command, reply in replies.ANSWERS.items():
-        yield from _struct(command, f"For: {command.role.value}. Answer: {_link(reply)}.")
+        said = f"For: {command.role.value}. Answer: {tables.link(reply)}."
+        yield from tables.struct(command, said)
     yield "## Replies\n\nEach has a field `type`, its name.\n"
-    yield from _structs(replies.AnyReply)
+    yield from tables.structs(replies.AnyReply)
     yield "## Events\n\nThe `body` of an event; each has a field `type`, its name.\n"
     for cls in get_args(AnyEvent):
-        yield from _struct(cls, f"Topic: `{cls.topic}`.")
+        yield from tables.struct(cls, f"Topic: `{cls.topic}`.")
     yield "## Scans\n\nThe `spec` of `submit`; a field `method` says which.\n"
-    yield from _structs(AnyScan)
+    yield from tables.structs(AnyScan)
     yield "## Patterns\n\nWhat `show` shows; a field `pattern` says which.\n"
-    yield from _structs(AnyPattern)
+    yield from tables.structs(AnyPattern)
     yield "## Facts\n\nParts of the above.\n"
     for fact in _FACTS:
-        yield from _struct(fact)
+        yield from tables.struct(fact)
     for choices in _CHOICES:
-        yield from _enum(choices)
+        yield from tables.choices(choices)
     yield "## Errors\n"
-    yield from _struct(ErrorInfo)
-    yield from _enum(Code)
+    yield from tables.struct(ErrorInfo)
+    yield from tables.choices(Code)
     yield """\
 ## Keys
 

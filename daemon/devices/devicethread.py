@@ -24,9 +24,9 @@ from drivers.base.errors import DeviceError, DeviceGarbled, DeviceTimeout
 D = TypeVar("D", bound=Device)
 T = TypeVar("T")
 
-_IDLE_BEAT_S = 0.25
-_HALT_GRACE_S = 1.0
-_HALT_AGAIN_S = 0.25
+_IDLE_BEAT_S = 0.25  # how often an idle thread shows life
+_HALT_GRACE_S = 1.0  # for a call to come back after a halt; then it is stuck
+_HALT_AGAIN_S = 0.25  # how often a wait looks whether its session has ended
 
 log = structlog.get_logger(__name__)
 

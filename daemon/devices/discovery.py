@@ -25,7 +25,7 @@ from protocol.errors import Code, UmbraError
 from protocol.messages.findings import Found, Search
 from protocol.messages.rig import DeviceInfo
 
-_START_S = 60.0
+_START_S = 60.0  # for a process to start, one of many, on a busy machine
 _ASKED = b"\n"  # what the process says first, when the driver is about to be asked
 
 KINDS = ("camera", "projector", "stage", "light")

@@ -28,10 +28,10 @@ from protocol.messages.rig import DeviceInfo, Health
 
 CONNECT_S = 20.0
 """Deadline of a connect: the slowest is a camera's SDK that enumerates."""
-CHECK_S = 2.0
-SAFE_S = 5.0
-CHECK_EVERY_S = 2.0
-_RETRY_S = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+CHECK_S = 2.0  # deadline of a sign of life
+SAFE_S = 5.0  # deadline of a safe state
+CHECK_EVERY_S = 2.0  # between two signs of life
+_RETRY_S = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)  # pauses between attempts to connect
 
 log = structlog.get_logger(__name__)
 
@@ -204,7 +204,9 @@ class Rig:
             return
         if isinstance(error, DeviceLost) or member.thread.stuck:
             member.stale = member.pending
-            self._set(member, Health.STUCK if member.thread.stuck else Health.LOST, str(error))
+            known = member.health is Health.LOST  # the first error was the cause
+            message = member.message if known else str(error)
+            self._set(member, Health.STUCK if member.thread.stuck else Health.LOST, message)
 
     @contextlib.contextmanager
     def noticing(self) -> Iterator[None]:

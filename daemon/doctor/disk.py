@@ -10,11 +10,11 @@ from pathlib import Path
 from daemon.doctor.verdict import failed, ok, skipped, warning
 from protocol.messages.findings import Check
 
-_PART = 4 << 20
-_MOST = 128 << 20
-_SECONDS = 1.0
-_FEW_FRAMES = 1000
-_MARGIN = 1.5
+_PART = 4 << 20  # bytes written at a time
+_MOST = 128 << 20  # bytes that are written at most ...
+_SECONDS = 1.0  # ... and for how long
+_FEW_FRAMES = 1000  # room for fewer is worth a warning
+_MARGIN = 1.5  # times the camera's rate that a disk should manage
 
 
 def space(free: int, reserve: int, frame_bytes: int | None) -> Check:

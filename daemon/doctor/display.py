@@ -15,7 +15,7 @@ from protocol.messages.findings import Check
 
 FLIPS = 16
 _SHOW_S = 5.0
-_TOLERANCE = 0.03
+_TOLERANCE = 0.03  # part of a period by which flips may be off
 
 
 def check(projector: DeviceThread[Projector], session: Session) -> Check:

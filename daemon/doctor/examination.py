@@ -32,7 +32,7 @@ from protocol.errors import Code, UmbraError
 from protocol.messages.findings import Check
 from protocol.messages.rig import Health
 
-_LEASE_S = 120.0
+_LEASE_S = 120.0  # longer than any examination takes
 
 log = structlog.get_logger(__name__)
 

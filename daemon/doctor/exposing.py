@@ -22,12 +22,12 @@ from protocol.messages.findings import Check
 SHOTS = 4
 SETTLE_S = 0.3
 """Longer than any projector's latency: before it is known there is no event to wait for."""
-_PATIENCE_S = 2.0
+_PATIENCE_S = 2.0  # beyond exposure and readout, until a frame is called lost
 _CALL_S = 5.0
-_LATE_S = 0.25
+_LATE_S = 0.25  # a frame that is here, or stamped, so late is worth a warning
 _WIRE_S = 0.5  # a frame that no pulse has asked for by then does not come
 _SEEN = 0.01  # of full scale: what light must change at least
-_SATURATED = 0.01
+_SATURATED = 0.01  # of the pixels
 _PROMPT_S = 5e-3  # a frame that begins this soon after the flip began at it
 _TRIES = 4  # a busy host takes longer to trigger it, at times
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -155,7 +155,7 @@ class Apparatus:
         )
 
     def acquire(self, wanted: Acquisition) -> bool:
-        """Have the camera acquire in this way from now on; whether it did not already."""
+        """Have the camera acquire in this way from now on. True: it did not already."""
         if self._acquisition is wanted:
             return False
         at = self._taken
@@ -191,9 +191,10 @@ class Apparatus:
         return self.when_recorded(self.ring.take)
 
     def when_recorded(self, ask: Callable[[float], T | None]) -> T:
-        """What `ask`, given the seconds that it may wait, has when the recorder has got on.
+        """Call `ask`, with the seconds that it may wait, until it has something to give: until the
+        recorder has caught up.
 
-        There may have been a pause meanwhile, for a disk that is full: nothing may be under way.
+        There may be a pause meanwhile, for a disk that is full, so nothing may be under way.
         Raises Behind, Revoked, or what went wrong in the recorder.
         """
         due = time.monotonic() + RING_S
@@ -229,7 +230,7 @@ class Apparatus:
         return Drawing(pattern, sent, look_of(image))
 
     def drawn(self, pattern: AnyPattern) -> Drawing:
-        """The same, remembered until another one is asked for."""
+        """As `draw`; the last one is remembered."""
         if self._drawing is None or self._drawing.pattern != pattern:
             self._drawing = self.draw(pattern)
         return self._drawing
@@ -257,43 +258,23 @@ class Apparatus:
         stage_mm: tuple[float, float] | None = None,
     ) -> None:
         """Hand a frame on; `way`: how it was exposed."""
-        self._taken += 1
         self.count(way)
-        self.recorder.put(
-            Exposed(
-                step=step,
-                index=index,
-                sub=sub,
-                frame=frame,
-                buffer=buffer,
-                stage_mm=stage_mm,
-                lit_ns=lit_ns,
-                exposing=self._counted(),
-            )
-        )
+        self._record(Exposed(step, index, sub, frame, buffer, stage_mm=stage_mm, lit_ns=lit_ns))
 
     def miss(self, index: int, step: Step, sub: int, reason: str) -> None:
         """Record that a frame could not be had, and why."""
-        self._taken += 1
         log.error("frame missing", step=index, sub=sub, reason=reason)
-        self.recorder.put(
-            Exposed(
-                step=step,
-                index=index,
-                sub=sub,
-                frame=None,
-                missing=reason,
-                exposing=self._counted(),
-            )
-        )
+        self._record(Exposed(step, index, sub, None, missing=reason))
 
     def count(self, name: str, more: int = 1) -> None:
         """Count what run.json tells about the exposing."""
         self._exposing[name] = self._exposing.get(name, 0) + more
 
-    def _counted(self) -> dict[str, int]:
+    def _record(self, exposed: Exposed) -> None:
+        """Hand it over, with what was counted since the one before."""
+        self._taken += 1
         counted, self._exposing = self._exposing, {}
-        return counted
+        self.recorder.put(replace(exposed, exposing=counted))
 
     def out_of_light(self, frame: Frame, from_ns: int, until_ns: int) -> str:
         """Why a frame was not exposed wholly within a time; "" if it was. 0: no end to it."""

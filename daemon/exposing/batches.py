@@ -40,7 +40,7 @@ class Batches:
         """`strict`: what no sequence can hold raises Unsuitable, where it is a matter of
         settings."""
         assert apparatus.projector is not None
-        self._its = apparatus
+        self._apparatus = apparatus
         self._projector = apparatus.projector.device
         self._limits = limits
         self._strict = strict
@@ -64,7 +64,7 @@ class Batches:
         """White, then black. Light that is a period late makes them dark and white; early, black
         and the first pattern: never the first brighter than the second."""
         return [
-            Shot(-1, Expose(pattern, lighting), 0, self._its.draw(pattern))
+            Shot(-1, Expose(pattern, lighting), 0, self._apparatus.draw(pattern))
             for pattern, lighting in ((WHITE, Lighting.WHITE), (BLACK, Lighting.BLACK))
         ]
 
@@ -88,7 +88,9 @@ class Batches:
         shots: list[Shot] = []
         drawing: Drawing | None = None
         most, head = 0, index
-        while isinstance(step := self._its.method.step(index, self._its.recorder.summary), Expose):
+        while isinstance(
+            step := self._apparatus.method.step(index, self._apparatus.recorder.summary), Expose
+        ):
             if shots and step.exposure_us != shots[0].step.exposure_us:
                 break
             if index == head:
@@ -96,7 +98,7 @@ class Batches:
             if not most or step.pattern is None or step.delay_s or len(shots) >= most:
                 break
             if drawing is None or drawing.pattern != step.pattern:
-                drawing = self._its.draw(step.pattern)
+                drawing = self._apparatus.draw(step.pattern)
             if not self._has_levels(drawing.image):
                 break
             room = most - len(shots)
@@ -117,13 +119,13 @@ class Batches:
         info = self._projector.info()
         images = min(found.images, self._most, IMAGES_BYTES // (info.width * info.height))
         # Half of the ring: the other half is being recorded meanwhile.
-        return max(0, min(images - GUARDS, (self._its.ring.count + 1) // 2))
+        return max(0, min(images - GUARDS, (self._apparatus.ring.count + 1) // 2))
 
     def pace(self, step: Expose) -> Pace:
         """How fast a sequence may go at a step's exposure. Raises Unsuitable."""
-        exposure_us = step.exposure_us or self._its.first_exposure_us or 0.0
-        info = self._its.info
-        wanted = pace(info, self._limits, exposure_us, self._its.patience.period_us)
+        exposure_us = step.exposure_us or self._apparatus.first_exposure_us or 0.0
+        info = self._apparatus.info
+        wanted = pace(info, self._limits, exposure_us, self._apparatus.patience.period_us)
         if self._slower == 1:
             return wanted
         try:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from daemon.devices.devicethread import Revoked, Session
 from protocol.messages.runs import End, RunState
 
-_CHECK_S = 0.25
+_CHECK_S = 0.25  # how often a pause looks whether there is anything left to go on with
 
 
 class Control:

@@ -25,8 +25,8 @@ CALL_S = 5.0
 """Deadline of a call that does not wait for the motion's end."""
 HOME_S = 120.0
 """Deadline of homing: the longest travel at the slowest seek."""
-_BEAT_S = 0.5
-_PUMP_S = 0.05
+_BEAT_S = 0.5  # between two signs of life while it homes
+_PUMP_S = 0.05  # how often the planner is filled
 _JOIN_S = 2 * CALL_S
 
 _Leg = Callable[[Stage], None]

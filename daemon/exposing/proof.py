@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting
 
-_SAMPLES = 20_000
+_SAMPLES = 20_000  # of a frame
 _BLIND = 0.4  # of the samples saturated: from here a frame is not judged
 _BRIGHTER = 5.0  # standard errors: by how much white must be brighter than black, at least
 _OFF_LEVEL = 0.4  # of the way from black to white: how far a pattern's brightness may be off
@@ -50,7 +50,7 @@ _PLACES = 64  # in each block, where two images are compared
 _EVENLY = 0.4  # of the mean change of two images: what each block must have of it
 _BANDS = 8  # of a frame's rows
 _CELLS = 16  # of a band, along its width: the light of a few tells nothing of a pattern's level
-_MANY_CELLS = 6
+_MANY_CELLS = 6  # that light must come from, for a band to be judged by its level
 #: what tells the patterns of a family apart
 _PLACE = {"shift_x", "shift_y", "shift", "phase", "seed", "index", "inverted"}
 

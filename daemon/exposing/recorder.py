@@ -18,7 +18,6 @@ import contextvars
 import queue
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -28,10 +27,12 @@ from typing import Any, TypeVar
 import structlog
 
 from daemon.exposing.ring import Buffer, Ring
+from daemon.exposing.unusable import UNFORESEEN, named
 from daemon.scans.method import Expose, Method, Step, Taken
 from daemon.separation.estimator import Components, NotYet, Result
 from daemon.storage.durable import StorageError
 from daemon.storage.frames import FrameRecord, FrameStore
+from daemon.storage.ledger import Ledger, Tally
 from drivers.base.camera import Frame
 from drivers.clock import NS
 from protocol.errors import Code
@@ -41,7 +42,7 @@ R = TypeVar("R")
 _GROUP_FRAMES = 16
 _GROUP_S = 0.25
 """A commit comes at the latest after so many frames or seconds; sooner when nothing waits."""
-_PATIENCE_S = 0.25
+_PATIENCE_S = 0.25  # how often a full queue is tried again, and the other worker looked at
 
 log = structlog.get_logger(__name__)
 
@@ -59,20 +60,6 @@ class Exposed:
     stage_mm: tuple[float, float] | None = None
     lit_ns: int = 0  # from when the light was said to be the step's; 0: not known
     exposing: Mapping[str, int] = field(default_factory=dict)  # see `FrameRecord`
-
-
-@dataclass(frozen=True, slots=True)
-class Tally:
-    """What has become of the frames; `recorded` and `missing` are committed, all are counted."""
-
-    recorded: int = 0
-    missing: int = 0
-    rejected: int = 0
-
-    @property
-    def taken(self) -> int:
-        """Frames that the plan need not expose again."""
-        return self.recorded + self.missing
 
 
 def _iso(utc_ns: int) -> str:
@@ -113,15 +100,13 @@ class Recorder:
         self._estimator = method.estimator()
         self._failure: BaseException | None = None
         self._summary: Mapping[str, float] = {}
-        self._tally = Tally()
+        self.ledger = Ledger()
+        """What has become of the frames so far."""
         self._handed = 0  # frames put by the sequencer, and of these ...
         self._taken_in = 0  # ... in the estimator
         self._changed = threading.Condition()
         self._concluding = threading.Lock()  # once the separator has ended anybody may ask
-        self._exposing: Counter[str] = Counter()
         self._hurried = False
-        self._missing_patterns: dict[int, str] = {}  # and why, last
-        self._seen_patterns: set[int] = set()
         self._incoming: queue.Queue[Exposed | None] = queue.Queue(maxsize=ring.count + 1)
         self._accepted: queue.Queue[tuple[Exposed, FrameRecord] | Future[Result] | None] = (
             queue.Queue(maxsize=ring.count + 8)
@@ -141,24 +126,16 @@ class Recorder:
         frame.
         """
         position = (0, 0)
-        recorded = missing = rejected = 0
         scratch: Buffer | None = None
         for record in self._frames.records():
             on_frame()
             position = (record.step, record.sub + 1)
-            self._exposing.update(record.exposing)
-            if record.missing:
-                missing += 1
-                self._tally = Tally(recorded, missing, rejected)
-                self._missing_patterns[record.observation.pattern] = record.missing
-                continue
-            scratch = self._frames.read(record.index, out=scratch)
-            self._method.recall(scratch, record.observation)
-            self._estimator.update(scratch, record.observation)
-            self._note(record)
-            recorded += 1
-            rejected += not record.observation.used
-            self._tally = Tally(recorded, missing, rejected)
+            if not record.missing:
+                scratch = self._frames.read(record.index, out=scratch)
+                with named(record.index, record.source):
+                    self._method.recall(scratch, record.observation)
+                    self._estimator.update(scratch, record.observation)
+            self.ledger.note(record)
         self._summary = self._estimator.summary()
         return position
 
@@ -185,24 +162,13 @@ class Recorder:
 
     @property
     def tally(self) -> Tally:
-        """What has become of the frames so far."""
-        return self._tally
+        """How many frames there are of each kind so far."""
+        return self.ledger.tally
 
     @property
     def summary(self) -> Mapping[str, float]:
         """The estimator's figures after the last frame that it took in."""
         return self._summary
-
-    @property
-    def lost_patterns(self) -> dict[int, str]:
-        """Patterns of which no frame could be had, and why."""
-        missing = sorted(self._missing_patterns.items())
-        return {pattern: why for pattern, why in missing if pattern not in self._seen_patterns}
-
-    @property
-    def exposing(self) -> Mapping[str, int]:
-        """The sum of what the records say of it."""
-        return dict(self._exposing)
 
     def hurry(self) -> None:
         """The run ends without a result: frames are made durable and counted, and taken in no
@@ -299,18 +265,17 @@ class Recorder:
     def _accept(self, exposed: Exposed) -> FrameRecord:
         frame = exposed.frame
         step = exposed.step
-        observation = self._method.observe(
-            step,
-            Taken(
-                step=exposed.index,
-                sub=exposed.sub,
-                incomplete=frame is None or frame.incomplete,
-                source=frame.source if frame else "",
-                pixels=frame.pixels if frame else None,
-                delay_us=(frame.start_ns - exposed.lit_ns) / 1e3 if frame and exposed.lit_ns else 0,
-                exposure_us=frame.exposure_us if frame else 0.0,
-            ),
+        taken = Taken(
+            step=exposed.index,
+            sub=exposed.sub,
+            incomplete=frame is None or frame.incomplete,
+            source=frame.source if frame else "",
+            pixels=frame.pixels if frame else None,
+            delay_us=(frame.start_ns - exposed.lit_ns) / 1e3 if frame and exposed.lit_ns else 0,
+            exposure_us=frame.exposure_us if frame else 0.0,
         )
+        with named(len(self._frames), taken.source):
+            observation = self._method.observe(step, taken)
         record = FrameRecord(
             index=len(self._frames),
             step=exposed.index,
@@ -367,32 +332,18 @@ class Recorder:
                 self._answer(item)
                 continue
             exposed, record = item
-            self._exposing.update(record.exposing)
-            tally = self._tally
-            if exposed.frame is None:
-                self._missing_patterns[record.observation.pattern] = record.missing
-                self._tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
-            else:
-                if not self._hurried:
-                    self._estimator.update(exposed.frame.pixels, record.observation)
-                self._note(record)
-                self._tally = Tally(
-                    tally.recorded + 1,
-                    tally.missing,
-                    tally.rejected + (not record.observation.used),
-                )
             if not self._hurried:
+                if exposed.frame is not None:
+                    with named(record.index, record.source):
+                        self._estimator.update(exposed.frame.pixels, record.observation)
                 self._summary = self._estimator.summary()
+            self.ledger.note(record)
             with self._changed:
                 self._taken_in += 1
                 self._changed.notify_all()
-            self._on_taken(self._tally, self._summary, exposed)
+            self._on_taken(self.tally, self._summary, exposed)
             if exposed.buffer is not None:
                 self._ring.give(exposed.buffer)
-
-    def _note(self, record: FrameRecord) -> None:
-        if record.observation.used:
-            self._seen_patterns.add(record.observation.pattern)
 
     def _conclude(self) -> Result:
         result = self._estimator.result()
@@ -401,5 +352,5 @@ class Recorder:
     def _answer(self, future: Future[Result]) -> None:
         try:
             future.set_result(self._conclude())
-        except (NotYet, ValueError, ArithmeticError) as error:
+        except (NotYet, *UNFORESEEN) as error:  # told to who asks; the scan goes on
             future.set_exception(error)

@@ -9,15 +9,21 @@ camera is stopped, and its exposure is as it was before.
 
 from __future__ import annotations
 
+import math
+
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.exposer import Exposer
 from daemon.exposing.modes import Choice, Mode
+from daemon.exposing.ring import Ring
 from daemon.exposing.sequences import Sequences
 from daemon.exposing.stepped import Stepped
 from daemon.exposing.streamed import Streamed
 from daemon.exposing.video import Video
-from daemon.scans.method import Digest, Expose, Watch
+from daemon.scans.method import Bench, Digest, Expose, Watch
 from drivers.base.errors import DeviceError
+
+_SEQUENCE_BYTES = 256 << 20
+"""Memory for the frames of hardware-timed sequences, where fewer are asked for."""
 
 
 def exposer_for(choice: Choice, apparatus: Apparatus) -> Exposer:
@@ -35,11 +41,23 @@ def exposer_for(choice: Choice, apparatus: Apparatus) -> Exposer:
     return Sequences(apparatus, single, strict=choice.strict)
 
 
+def ring_for(choice: Choice, bench: Bench, planned: int | None, least: int) -> Ring:
+    """The ring of a run that exposes in this way, of `least` frames or more: of a sequence all
+    frames are kept until it is known to be in step, while the one before is being recorded."""
+    info, limits = bench.camera, bench.projector.sequence if bench.projector else None
+    count = least
+    if choice.mode is Mode.HARDWARE and limits is not None:
+        frame_bytes = math.prod(info.shape) * info.pixel_format.dtype.itemsize
+        wanted = 2 * min(limits.images, planned or limits.images)
+        count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
+    return Ring(count, info.shape, info.pixel_format.dtype)
+
+
 class Sequencer:
     """One scan in its course, in the thread that calls `run`."""
 
     def __init__(self, apparatus: Apparatus, exposer: Exposer) -> None:
-        self._its = apparatus
+        self._apparatus = apparatus
         self._exposer = exposer
         self._video = Video(apparatus)
         self.reason = "all steps were exposed"
@@ -49,13 +67,13 @@ class Sequencer:
 
         Raises Revoked (abort), DeviceError, Behind, or what the recorder raises.
         """
-        its = self._its
+        apparatus = self._apparatus
         try:
-            while (step := its.method.step(index, its.recorder.summary)) is not None:
-                its.may_go_on()
-                if its.control.paused:
+            while (step := apparatus.method.step(index, apparatus.recorder.summary)) is not None:
+                apparatus.may_go_on()
+                if apparatus.control.paused:
                     self._exposer.settle()
-                its.checkpoint()
+                apparatus.checkpoint()
                 if isinstance(step, Expose):
                     index, sub = self._exposer.expose(index, step, sub)
                     continue
@@ -79,11 +97,11 @@ class Sequencer:
 
     def _digest(self) -> None:
         """Wait until the estimator knows every frame so far."""
-        recorder = self._its.recorder
-        self._its.when_recorded(lambda seconds: recorder.digested(seconds) or None)
+        recorder = self._apparatus.recorder
+        self._apparatus.when_recorded(lambda seconds: recorder.digested(seconds) or None)
 
     def _stop(self) -> None:
         """Nothing more is exposed, and the recorder may wait long for room: not in this light."""
-        if not self._its.session.ended.is_set():
-            self._its.rest()
-            self._its.set_exposure(None)
+        if not self._apparatus.session.ended.is_set():
+            self._apparatus.rest()
+            self._apparatus.set_exposure(None)

@@ -45,7 +45,7 @@ from drivers.base.projector import LoadedSequence
 from drivers.sequence import mismatch
 
 WAY = "hardware"
-_LOAD_S = 30.0
+_LOAD_S = 30.0  # deadline of loading a sequence's images
 _START_S = 1.0  # from `run` to the first pulse, beyond a frame's own deadline
 _BEYOND = 1.5  # periods after the last frame in which none may come
 
@@ -65,7 +65,7 @@ class Sequences(Exposer):
         assert apparatus.projector is not None
         limits = apparatus.projector.device.info().sequence
         assert limits is not None
-        self._its = apparatus
+        self._apparatus = apparatus
         self._single = single
         self._strict = strict
         self._projector = apparatus.projector
@@ -85,7 +85,7 @@ class Sequences(Exposer):
         if not shots or (len(shots) <= GUARDS and self._single is not None):
             return self._alone(index, step, first)  # a sequence would be more guards than frames
         self.settle()
-        self._its.set_exposure(step.exposure_us)
+        self._apparatus.set_exposure(step.exposure_us)
         try:
             return self._sequence(shots)
         except _CalledOff:
@@ -118,53 +118,55 @@ class Sequences(Exposer):
     # ------------------------------------------------------------ one sequence
 
     def _sequence(self, shots: list[Shot]) -> tuple[int, int]:
-        its = self._its
+        apparatus = self._apparatus
         guards = self._batches.guards()
-        shape, dtype = its.info.shape, its.info.pixel_format.dtype
+        shape, dtype = apparatus.info.shape, apparatus.info.pixel_format.dtype
         scratch = [np.empty(shape, dtype) for _ in guards]
         buffers: list[Buffer] = []
         try:
             while len(buffers) < len(shots):
-                buffers.append(its.buffer())
-            its.lit = None
-            its.acquire(Acquisition.HARDWARE)
+                buffers.append(apparatus.buffer())
+            apparatus.lit = None
+            apparatus.acquire(Acquisition.HARDWARE)
             loaded = self._load([*guards, *shots])
-            for attempt in range(1, its.patience.attempts + 1):
-                its.may_go_on()
+            for attempt in range(1, apparatus.patience.attempts + 1):
+                apparatus.may_go_on()
                 found, problem = self._attempt(
                     loaded, [*guards, *shots], [*scratch, *buffers, scratch[0]]
                 )
                 if not problem:
                     for shot, frame in zip(shots, found[len(guards) :], strict=True):
                         buffer = buffers.pop(0)
-                        its.put(shot.index, shot.step, shot.sub, frame, buffer, way=WAY)
+                        apparatus.put(shot.index, shot.step, shot.sub, frame, buffer, way=WAY)
                     return _after(shots[-1])
-                its.count("repeated")
+                apparatus.count("repeated")
                 log.warning(
-                    "sequence exposed again" if attempt < its.patience.attempts else "given up",
+                    "sequence exposed again"
+                    if attempt < apparatus.patience.attempts
+                    else "given up",
                     step=shots[0].index,
                     images=loaded.images,
                     attempt=attempt,
                     problem=problem,
                 )
-                if attempt < its.patience.attempts:
+                if attempt < apparatus.patience.attempts:
                     self._batches.slow_down()
-                    its.acquire(Acquisition.HARDWARE)
+                    apparatus.acquire(Acquisition.HARDWARE)
                     loaded = self._load([*guards, *shots])
             if not found:
                 raise self._nothing_came(loaded)
             for shot in shots:
-                its.miss(shot.index, shot.step, shot.sub, problem)
+                apparatus.miss(shot.index, shot.step, shot.sub, problem)
             return _after(shots[-1])
         finally:
             for buffer in buffers:
-                its.ring.give(buffer)
+                apparatus.ring.give(buffer)
 
     def _load(self, shots: Sequence[Shot]) -> LoadedSequence:
         images = [shot.drawing.image for shot in shots]
         period_us = self._batches.pace(shots[-1].step).period_us
         return self._projector.call(
-            lambda p: p.load(images, period_us, period_us), _LOAD_S, self._its.session
+            lambda p: p.load(images, period_us, period_us), _LOAD_S, self._apparatus.session
         )
 
     def _attempt(
@@ -176,10 +178,10 @@ class Sequences(Exposer):
         Raises _CalledOff. Whatever happens, no pulse and no grab is left behind, and after a
         failure the camera is stopped.
         """
-        its = self._its
+        apparatus = self._apparatus
         off = threading.Event()
-        first_s = its.frame_deadline() + _START_S
-        waits = [first_s] + [its.frame_deadline()] * (len(shots) - 1)
+        first_s = apparatus.frame_deadline() + _START_S
+        waits = [first_s] + [apparatus.frame_deadline()] * (len(shots) - 1)
         waits.append(_BEYOND * loaded.period_us * 1e-6)
         grabs = [
             self._grab(buffer, wait_s, off) for buffer, wait_s in zip(buffers, waits, strict=True)
@@ -187,15 +189,15 @@ class Sequences(Exposer):
         frames: list[Frame] = []
         problem = "it was not run to its end"
         try:
-            began_ns = self._projector.call(lambda p: p.run(), SHOW_S, its.session)
+            began_ns = self._projector.call(lambda p: p.run(), SHOW_S, apparatus.session)
             self._batches.prepare(_after(shots[-1]))  # while this one is exposed
-            judges = its.looks.fork() if its.looks is not None else None
+            judges = apparatus.looks.fork() if apparatus.looks is not None else None
             *awaited, beyond = zip(grabs, waits, strict=True)
             problem = self._collect(awaited, shots, frames, judges, loaded, began_ns)
             if not problem:
                 problem = self._one_more(*beyond, frames)
             if not problem:
-                its.looks = judges
+                apparatus.looks = judges
         finally:
             if problem:
                 self._call_off(grabs, off)
@@ -207,7 +209,7 @@ class Sequences(Exposer):
                 raise DeviceTimeout(camera.name, "grab", "the sequence was called off")
             return camera.grab(buffer, wait_s)
 
-        return self._its.camera.submit(grab, wait_s + CALL_S, self._its.session)
+        return self._apparatus.camera.submit(grab, wait_s + CALL_S, self._apparatus.session)
 
     def _collect(
         self,
@@ -237,7 +239,7 @@ class Sequences(Exposer):
         """Why the last of the frames does not look like what was shown for it; "" if it does."""
         if len(frames) == GUARDS:
             white, black = (frame.pixels for frame in frames)
-            return head_problem(white, black, self._its.info.pixel_format.full_scale)
+            return head_problem(white, black, self._apparatus.info.pixel_format.full_scale)
         if len(frames) < GUARDS or judges is None:
             return ""
         return judges.problem(frames[-1].pixels, shot.step, shot.drawing.look)
@@ -256,21 +258,21 @@ class Sequences(Exposer):
 
     def _wait(self, grab: Future[Frame], wait_s: float) -> Frame:
         """Wait for a frame, and for a pause. Raises _CalledOff, and what the grab does."""
-        its = self._its
-        its.may_go_on()
+        apparatus = self._apparatus
+        apparatus.may_go_on()
         due = time.monotonic() + wait_s + CALL_S
         while not grab.done() and time.monotonic() < due:
-            if its.control.paused:
+            if apparatus.control.paused:
                 raise _CalledOff
             wait_for([grab], LOOK_S)
-        return its.camera.wait(grab, 0.0)
+        return apparatus.camera.wait(grab, 0.0)
 
     def _call_off(self, grabs: Sequence[Future[Frame]], off: threading.Event) -> None:
         """No more pulses, no more grabs, the camera stopped, each whether the other could be ended
         or not. A device that is gone is met again, and raised, when the sequence is repeated."""
-        its = self._its
+        apparatus = self._apparatus
         off.set()
-        if its.session.ended.is_set():
+        if apparatus.session.ended.is_set():
             return  # whoever revoked it has halted the devices and made them safe
         for end in (self._end_pulses, lambda: self._end_grabs(grabs)):
             try:
@@ -279,18 +281,18 @@ class Sequences(Exposer):
                 log.warning("the sequence did not end as it should", problem=str(error))
 
     def _end_pulses(self) -> None:
-        self._projector.call(lambda p: p.stop(), SHOW_S, self._its.session)
+        self._projector.call(lambda p: p.stop(), SHOW_S, self._apparatus.session)
 
     def _end_grabs(self, grabs: Sequence[Future[Frame]]) -> None:
-        its = self._its
+        apparatus = self._apparatus
         if not all(grab.done() for grab in grabs):
-            its.camera.device.halt()
+            apparatus.camera.device.halt()
         wait_for(grabs, CALL_S)
-        its.stop()
+        apparatus.stop()
 
     def _nothing_came(self, loaded: LoadedSequence) -> DeviceError:
         return DeviceTimeout(
-            self._its.camera.device.name,
+            self._apparatus.camera.device.name,
             "grab",
             f"no frame came for any of {loaded.images} trigger pulses",
             "check the cable from the projector's trigger output, and trigger_line and "

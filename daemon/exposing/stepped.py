@@ -59,31 +59,33 @@ class Stepped(Exposer):
     """See the module."""
 
     def __init__(self, apparatus: Apparatus) -> None:
-        self._its = apparatus
+        self._apparatus = apparatus
         self._pending: _Exposure | None = None  # exposed or being read out
         self._read: _Exposure | None = None  # read out, and not yet looked at
 
     def expose(self, index: int, step: Expose, first: int) -> tuple[int, int]:
         """See Exposer."""
-        its = self._its
+        apparatus = self._apparatus
         if first < step.frames:
-            if its.needs_exposure(step.exposure_us):
+            if apparatus.needs_exposure(step.exposure_us):
                 self.settle()  # what is being read out was exposed as before
-                its.set_exposure(step.exposure_us)
-            if its.lit is not None and _next_of_bracket(its.lit.step, step):
-                its.lit = replace(its.lit, step=step)  # the light is this step's already
+                apparatus.set_exposure(step.exposure_us)
+            if apparatus.lit is not None and _next_of_bracket(apparatus.lit.step, step):
+                # The light is this step's already.
+                apparatus.lit = replace(apparatus.lit, step=step)
             else:
-                its.acquire(Acquisition.SOFTWARE)
+                apparatus.acquire(Acquisition.SOFTWARE)
                 self._light(step)
         for sub in range(first, step.frames):
             self._read_out()
-            if its.control.paused:
+            if apparatus.control.paused:
                 self._hand_on()
-            its.checkpoint()  # the frames of a long step would fill the ring while the disk is full
+            # The frames of a long step would fill the ring while the disk is full.
+            apparatus.checkpoint()
             self._pending = self._trigger(index, step, sub, attempt=1)
             self._hand_on()
             if sub + 1 == step.frames:
-                its.draw_ahead(index + 1)
+                apparatus.draw_ahead(index + 1)
             self._await_exposure(self._pending)
         return index + 1, 0
 
@@ -94,42 +96,48 @@ class Stepped(Exposer):
 
     def _light(self, step: Expose) -> Lit:
         if self._pending is not None:
-            self._pending.dark_ns = self._its.clock.now_ns()
-        return self._its.light(step)
+            self._pending.dark_ns = self._apparatus.clock.now_ns()
+        return self._apparatus.light(step)
 
     def _trigger(self, index: int, step: Expose, sub: int, attempt: int) -> _Exposure:
-        its = self._its
-        buffer = its.buffer()
-        its.acquire(Acquisition.SOFTWARE)
-        lit = its.lit
+        apparatus = self._apparatus
+        buffer = apparatus.buffer()
+        apparatus.acquire(Acquisition.SOFTWARE)
+        lit = apparatus.lit
         if lit is None or lit.step is not step:  # an earlier pattern was shown again, or a pause
             lit = self._light(step)
-        if its.projector is not None:
-            its.clock.wait_until(lit.from_ns + round(step.delay_s * NS), its.session.ended)
-            its.session.check()
-        _, end_ns = its.camera.call(lambda c: c.trigger(), CALL_S, its.session)
-        timeout_s = its.frame_deadline()
-        grab = its.camera.submit(
-            lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, its.session
+        if apparatus.projector is not None:
+            apparatus.clock.wait_until(
+                lit.from_ns + round(step.delay_s * NS), apparatus.session.ended
+            )
+            apparatus.session.check()
+        _, end_ns = apparatus.camera.call(lambda c: c.trigger(), CALL_S, apparatus.session)
+        timeout_s = apparatus.frame_deadline()
+        grab = apparatus.camera.submit(
+            lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, apparatus.session
         )
-        return _Exposure(index, step, sub, lit, 0, end_ns + its.rolling_ns, buffer, grab, attempt)
+        return _Exposure(
+            index, step, sub, lit, 0, end_ns + apparatus.rolling_ns, buffer, grab, attempt
+        )
 
     def _await_exposure(self, exposure: _Exposure) -> None:
         """Wait for the end of the exposure, not of the readout: then the light may change."""
-        if self._its.projector is not None:
-            self._its.clock.wait_until(exposure.end_ns, self._its.session.ended)
-        self._its.session.check()
+        if self._apparatus.projector is not None:
+            self._apparatus.clock.wait_until(exposure.end_ns, self._apparatus.session.ended)
+        self._apparatus.session.check()
 
     def _read_out(self) -> None:
         """Wait for the frame that was triggered; it is exposed again where it is late or partial.
 
         By the device's word and time stamps only: how it looks is `_hand_on`'s question.
         """
-        its = self._its
+        apparatus = self._apparatus
         while (exposure := self._pending) is not None:
-            its.may_go_on()
+            apparatus.may_go_on()
             try:
-                exposure.frame = its.camera.wait(exposure.grab, its.frame_deadline() + CALL_S)
+                exposure.frame = apparatus.camera.wait(
+                    exposure.grab, apparatus.frame_deadline() + CALL_S
+                )
                 problem = self._out_of_light(exposure, exposure.frame)
             except Stuck:
                 raise
@@ -147,7 +155,7 @@ class Stepped(Exposer):
         The next frame may have been triggered meanwhile. After a doubtful one it is not trusted,
         and triggered anew.
         """
-        its = self._its
+        apparatus = self._apparatus
         later: _Exposure | None = None
         while (exposure := self._read) is not None:
             self._read = None
@@ -156,7 +164,9 @@ class Stepped(Exposer):
             if not problem:
                 index, step, sub = exposure.index, exposure.step, exposure.sub
                 lit_ns = exposure.lit.from_ns
-                its.put(index, step, sub, exposure.frame, exposure.buffer, way=WAY, lit_ns=lit_ns)
+                apparatus.put(
+                    index, step, sub, exposure.frame, exposure.buffer, way=WAY, lit_ns=lit_ns
+                )
                 break
             later = self._called_off() or later
             self._again(exposure, problem)
@@ -169,20 +179,22 @@ class Stepped(Exposer):
         exposure, self._pending = self._pending, None
         if exposure is not None:
             with contextlib.suppress(DeviceTimeout, DeviceGarbled):  # it would not have counted
-                self._its.camera.wait(exposure.grab, self._its.frame_deadline() + CALL_S)
-            self._its.ring.give(exposure.buffer)
+                self._apparatus.camera.wait(
+                    exposure.grab, self._apparatus.frame_deadline() + CALL_S
+                )
+            self._apparatus.ring.give(exposure.buffer)
         return exposure
 
     def _again(self, exposure: _Exposure, problem: str) -> None:
         """Expose a step once more, or record its frame as missing."""
-        its = self._its
+        apparatus = self._apparatus
         index, step, sub = exposure.index, exposure.step, exposure.sub
-        its.ring.give(exposure.buffer)
+        apparatus.ring.give(exposure.buffer)
         # After a doubtful frame nothing in the camera's queue can be trusted: empty it.
-        its.stop()
-        its.acquire(Acquisition.SOFTWARE)
-        if exposure.attempt < its.patience.attempts:
-            its.count("repeated")
+        apparatus.stop()
+        apparatus.acquire(Acquisition.SOFTWARE)
+        if exposure.attempt < apparatus.patience.attempts:
+            apparatus.count("repeated")
             log.warning(
                 "frame exposed again",
                 step=index,
@@ -194,20 +206,20 @@ class Stepped(Exposer):
             self._pending = self._trigger(index, step, sub, exposure.attempt + 1)
             self._await_exposure(self._pending)
         else:
-            its.miss(index, step, sub, problem)
+            apparatus.miss(index, step, sub, problem)
 
     def _out_of_light(self, exposure: _Exposure, frame: Frame) -> str:
         """Why the frame may show more or less than its pattern, by its time stamps; or ""."""
         if frame.incomplete:
             return "the frame is incomplete"
-        if self._its.projector is None:
+        if self._apparatus.projector is None:
             return ""
-        return self._its.out_of_light(frame, exposure.lit.from_ns, exposure.dark_ns)
+        return self._apparatus.out_of_light(frame, exposure.lit.from_ns, exposure.dark_ns)
 
     def _look(self, exposure: _Exposure, frame: Frame) -> str:
         """Why the frame does not look like its pattern; "" if it does, or has none."""
-        looks = self._its.looks
-        if looks is None or self._its.projector is None:
+        looks = self._apparatus.looks
+        if looks is None or self._apparatus.projector is None:
             return ""
         return looks.problem(frame.pixels, exposure.step, exposure.lit.look)
 

@@ -26,7 +26,7 @@ class Video:
     """Frames as they come; what the stream or the disk lost is an explicit missing record."""
 
     def __init__(self, apparatus: Apparatus) -> None:
-        self._its = apparatus
+        self._apparatus = apparatus
         self._silent = 0  # grabs in a row that gave nothing
         self._last: int | None = None  # number of the last frame since the stream began
         self._mover: Mover | None = None
@@ -37,20 +37,20 @@ class Video:
 
         Raises DeviceError, Revoked, Behind.
         """
-        its = self._its
+        apparatus = self._apparatus
         self._set_going(step)
-        going_ns, since = 0, its.clock.now_ns()  # before the last pause, and after it
+        going_ns, since = 0, apparatus.clock.now_ns()  # before the last pause, and after it
         sub: int | None = first
         try:
             while sub is not None and (step.frames is None or sub < step.frames):
-                its.may_go_on()
-                its.control.check(its.session)
-                if its.control.paused:
-                    going_ns += its.clock.now_ns() - since
+                apparatus.may_go_on()
+                apparatus.control.check(apparatus.session)
+                if apparatus.control.paused:
+                    going_ns += apparatus.clock.now_ns() - since
                     self._pause()
                     self._set_going(step)
-                    since = its.clock.now_ns()
-                if reason := self._enough((going_ns + its.clock.now_ns() - since) / NS):
+                    since = apparatus.clock.now_ns()
+                if reason := self._enough((going_ns + apparatus.clock.now_ns() - since) / NS):
                     return reason
                 sub = self._next(index, step, sub)
         finally:
@@ -62,25 +62,25 @@ class Video:
         """Stage and stream end, and begin anew, even if it is resumed before it came to a pause."""
         if self._mover is not None:
             self._mover.end()
-        if not self._its.checkpoint():
-            self._its.stop()
+        if not self._apparatus.checkpoint():
+            self._apparatus.stop()
 
     def _set_going(self, step: Watch) -> None:
         """Lights on, the stage going, the camera streaming."""
-        its = self._its
+        apparatus = self._apparatus
         for name in step.lights:
-            its.rig.lights[name].call(lambda x: x.set(True), CALL_S, its.session)
+            apparatus.rig.lights[name].call(lambda x: x.set(True), CALL_S, apparatus.session)
         self._mover = None
-        if step.motion is not None and its.rig.stage is not None:
+        if step.motion is not None and apparatus.rig.stage is not None:
             self._mover = Mover(
-                its.rig.stage,
+                apparatus.rig.stage,
                 step.motion,
-                its.session,
-                beat=its.may_go_on,
-                wake=its.camera.device.halt,
+                apparatus.session,
+                beat=apparatus.may_go_on,
+                wake=apparatus.camera.device.halt,
             )
             self._mover.begin()
-        its.acquire(Acquisition.FREE)
+        apparatus.acquire(Acquisition.FREE)
         self._last = None
 
     def _enough(self, seconds: float) -> str:
@@ -89,14 +89,14 @@ class Video:
             self._mover.check()
             if self._mover.over:
                 return "the stage's motion has come to its end"
-        return self._its.method.enough(self._its.recorder.summary, seconds)
+        return self._apparatus.method.enough(self._apparatus.recorder.summary, seconds)
 
     def _next(self, index: int, step: Watch, sub: int) -> int | None:
         """Take a frame or record why there is none; the next sub-index, None at the end of a
         recording."""
-        its, info, last = self._its, self._its.info, self._last
-        buffer = its.buffer() if info.recorded else its.ring.take(0.0)
-        if its.acquire(Acquisition.FREE):
+        apparatus, info, last = self._apparatus, self._apparatus.info, self._last
+        buffer = apparatus.buffer() if info.recorded else apparatus.ring.take(0.0)
+        if apparatus.acquire(Acquisition.FREE):
             last = self._last = None  # there was a pause, for a disk that is full
         behind = buffer is None
         if buffer is None:
@@ -104,38 +104,38 @@ class Video:
         try:
             frame = self._grab(buffer)
         except EndOfRecording:
-            its.ring.give(buffer)
+            apparatus.ring.give(buffer)
             return None
         if frame is None:
             if not behind:
-                its.ring.give(buffer)
+                apparatus.ring.give(buffer)
             if self._mover is not None:
                 self._mover.check()
             return sub  # what was exposed meanwhile shows as a gap in the sequence
         lost = 0 if last is None else max(0, frame.sequence - last - 1)
         for _ in range(lost if step.frames is None else min(lost, step.frames - sub - 1)):
-            its.miss(index, step, sub, "lost between camera and host")
+            apparatus.miss(index, step, sub, "lost between camera and host")
             sub += 1
         if behind:
-            its.miss(index, step, sub, "the recorder did not keep up")
+            apparatus.miss(index, step, sub, "the recorder did not keep up")
         else:
             at = self._mover.position_at(frame.mid_ns) if self._mover is not None else None
-            its.put(index, step, sub, frame, buffer, way=WAY, stage_mm=at)
+            apparatus.put(index, step, sub, frame, buffer, way=WAY, stage_mm=at)
         return sub + 1
 
     def _grab(self, buffer: Buffer) -> Frame | None:
         """The next frame of the stream; None if none came in time."""
-        its = self._its
-        timeout_s = its.frame_deadline()
+        apparatus = self._apparatus
+        timeout_s = apparatus.frame_deadline()
         try:
-            frame = its.camera.call(
-                lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, its.session
+            frame = apparatus.camera.call(
+                lambda c: c.grab(buffer, timeout_s), timeout_s + CALL_S, apparatus.session
             )
         except Stuck:
             raise
         except (DeviceTimeout, DeviceGarbled) as error:
             self._silent += 1
-            if self._silent >= its.patience.attempts:
+            if self._silent >= apparatus.patience.attempts:
                 raise
             log.warning("no frame", problem=str(error), silent=self._silent)
             return None
@@ -143,7 +143,7 @@ class Video:
         last = frame.sequence if self._last is None else self._last
         if not 0 <= frame.sequence - last <= _GAP:
             raise DeviceGarbled(
-                its.camera.device.name,
+                apparatus.camera.device.name,
                 "grab",
                 f"frame number {frame.sequence} came after {self._last}",
                 "reconnect the camera",

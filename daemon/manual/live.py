@@ -20,6 +20,7 @@ import structlog
 
 from daemon.devices.devicethread import DeviceThread, Revoked, Session
 from daemon.devices.rig import Rig
+from daemon.exposing.apparatus import CALL_S
 from daemon.pictures.display import common_white, for_display
 from daemon.pictures.viewfinder import WIDTH, Glimpse, Viewfinder, saturation_of
 from daemon.scans.single_image import SingleImageMethod
@@ -29,8 +30,7 @@ from drivers.base.errors import DeviceError
 
 SHARE = 0.25
 """Of one processor's time, at most."""
-_CALL_S = 5.0
-_PATIENCE_S = 2.0
+_PATIENCE_S = 2.0  # beyond exposure and readout, until a frame is called lost
 
 log = structlog.get_logger(__name__)
 
@@ -102,7 +102,7 @@ class Live:
 
     def _join(self) -> None:
         if self._thread is not None:
-            self._thread.join(2 * _CALL_S)
+            self._thread.join(2 * CALL_S)
 
     # ------------------------------------------------------------ its thread
 
@@ -127,7 +127,7 @@ class Live:
                 session.ended.wait(max(0.0, min(due, look.until) - time.monotonic()))
             if not session.ended.is_set():
                 with self._turn:
-                    camera.call(lambda c: c.stop(), _CALL_S, session)
+                    camera.call(lambda c: c.stop(), CALL_S, session)
         except Revoked:
             reason = "manual work ended"
         except DeviceError as error:
@@ -158,7 +158,7 @@ class Live:
                 if triggered or info.recorded or frame.end_ns >= asked_ns:
                     return frame, info
 
-        return camera.call(take, exposure_s + _PATIENCE_S + _CALL_S, session)
+        return camera.call(take, exposure_s + _PATIENCE_S + CALL_S, session)
 
     def _show(self, frame: Frame, info: CameraInfo, method: SingleImageMethod | None) -> None:
         self._viewfinder.offer(frame, info, now=True)

@@ -37,9 +37,10 @@ from protocol.messages.rig import LockInfo
 from protocol.patterns import AnyPattern, Stripes
 from protocol.scans.projected import SingleImage
 
-_OFF_S = 2.0
 _LIGHT_S = 600.0
 """How long a light that was switched on by hand stays on when nobody asks again."""
+_OFF_S = 2.0
+"""How long manual work goes on after one was switched off."""
 OWNER = "manual work"
 
 log = structlog.get_logger(__name__)

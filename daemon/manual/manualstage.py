@@ -25,6 +25,7 @@ import structlog
 
 from daemon.devices.devicethread import DeviceThread, Revoked, Session
 from daemon.devices.rig import Rig
+from daemon.exposing.motion import CALL_S
 from drivers.base.errors import DeviceError
 from drivers.base.stage import Stage
 from drivers.base.stage import StageState as DriverState
@@ -34,14 +35,12 @@ from protocol.messages.events import AnyEvent, StageChanged
 from protocol.messages.replies import StageStatus
 from protocol.messages.rig import StageState
 
-CALL_S = 5.0
-"""Deadline of a call that does not wait for the motion's end."""
 ENDLESS_S = 600.0
-_ASK_S = 2.0
-_PUMP_S = 0.05
-_TELL_S = 0.25
-_LEASE_S = 2.0
-_FINISH_S = 30.0
+_ASK_S = 2.0  # deadline of a question; a stage that is busy answers later
+_PUMP_S = 0.05  # how often the planner is filled
+_TELL_S = 0.25  # how often `stage-changed` is published at most
+_LEASE_S = 2.0  # of manual work, prolonged while a motion is followed
+_FINISH_S = 30.0  # how long a scan waits for a motion's end before it stops it
 _HALT_EVERY_S = 0.25
 
 log = structlog.get_logger(__name__)
@@ -197,6 +196,22 @@ class ManualStage:
                 Code.BUSY, "the stage is homing: wait for its end, or `umbra stage stop`"
             )
 
+    def _require_homed(self) -> None:
+        """What a stage would refuse in any case, as a state of the rig's that homing mends."""
+        now = self.status()
+        name = self._thread.device.name
+        if now.state is StageState.ALARM:
+            raise UmbraError(
+                Code.WRONG_STATE,
+                f"{name}: it is in alarm"
+                + (f": {now.detail}" if now.detail else "")
+                + "; look at it, then `umbra stage home`",
+            )
+        if now.position_mm is None:
+            raise UmbraError(
+                Code.WRONG_STATE, f"{name}: its position is not known; home it: `umbra stage home`"
+            )
+
     def _take_over(self) -> None:
         """Follow the motion under way no more: its pumping would wait behind what comes now, and
         a call that is late halts the stage."""
@@ -215,6 +230,7 @@ class ManualStage:
         with self._mutex:
             self._require_not_homing()
             session = self._use(_LEASE_S)
+            self._require_homed()
             self._take_over()
 
             def go(stage: Stage) -> None:

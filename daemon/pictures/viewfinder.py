@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from daemon.pictures.display import thumbnail
 from drivers.base.camera import CameraInfo, Frame
 
-_EVERY_S = 0.25
+_EVERY_S = 0.25  # between two pictures of a run
 WIDTH = 640
 _HISTOGRAM_BINS = 64
 

@@ -1,10 +1,11 @@
-"""What the quality bits mean to a person: a name, what is wrong, what to do, a colour."""
+"""What the quality bits mean to a person (quality.toml), and a picture of where they are."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from importlib import resources
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,101 +15,36 @@ from daemon.separation.estimator import Quality
 _DIMMED = 0.3
 
 
-@dataclass(frozen=True, slots=True)
-class Bit:
-    """One quality bit, explained. `colour` is sRGB; `fatal` bits leave a component unknown."""
+class Bit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One quality bit, explained. `name` is as in quality.json, `colour` sRGB as in CSS."""
 
-    flag: Quality
+    name: str
     meaning: str
     remedy: str
-    colour: tuple[int, int, int]
-    fatal: bool = False
+    colour: str
 
     @property
-    def name(self) -> str:
-        """As in quality.json."""
-        return (self.flag.name or "").lower()
+    def flag(self) -> Quality:
+        """The bit itself."""
+        return Quality[self.name.upper()]
 
     @property
-    def hex(self) -> str:
-        """The colour for CSS."""
-        return "#{:02x}{:02x}{:02x}".format(*self.colour)
+    def rgb(self) -> tuple[int, ...]:
+        """The colour's parts, 0 to 255."""
+        return tuple(bytes.fromhex(self.colour.removeprefix("#")))
 
 
-# In the order in which they are painted: the worse over the milder.
-BITS: tuple[Bit, ...] = (
-    Bit(
-        Quality.EDGE,
-        "An edge of the pattern lay here: the light is split as that of the pixels around.",
-        "Natural in two images and random phases. A checkerboard's shifts show every pixel whole; "
-        "larger checkers or patches have fewer edges.",
-        (178, 190, 195),
-    ),
-    Bit(
-        Quality.LOW_MODULATION,
-        "Direct light is not told from noise here.",
-        "Natural in shadow and in pure interreflection. Elsewhere: average more frames, expose "
-        "longer, or focus the projector.",
-        (86, 180, 233),
-    ),
-    Bit(
-        Quality.DARK,
-        "Hardly any light of the source arrives here.",
-        "Natural in shadow. Elsewhere: expose longer, or average more frames.",
-        (58, 96, 220),
-    ),
-    Bit(
-        Quality.SINGLE,
-        "One extreme rests on a single frame, so that noise or a fleck may pass for light.",
-        "Take more patterns or frames, so that each pixel is lit and shaded more than once.",
-        (201, 162, 126),
-    ),
-    Bit(
-        Quality.NEGATIVE,
-        "A component is below zero by more than noise.",
-        "Check the black level, the leakage b and the lit fraction; take black and white frames.",
-        (0, 184, 148),
-    ),
-    Bit(
-        Quality.DISAGREE,
-        "Patterns give different components here: global light varies within a patch or period.",
-        "Direct may be too large. Of several frequencies the finer is the one to trust; of one, a "
-        "finer pattern tells.",
-        (255, 159, 28),
-    ),
-    Bit(
-        Quality.RESIDUE,
-        "The pattern came by way of a mirror or of glass: reversed, finer or bent.",
-        "Don't trust it there: what is reflected counts as direct. Cover or powder the mirror.",
-        (255, 221, 64),
-    ),
-    Bit(
-        Quality.MOVED,
-        "Scene, camera or source changed between frames.",
-        "Keep everything still, let the lamp warm up, and scan again.",
-        (123, 209, 59),
-    ),
-    Bit(
-        Quality.SATURATED,
-        "A sample reached the end of the camera's scale: both components are too small.",
-        "Expose more briefly, or lower the gain.",
-        (255, 84, 54),
-    ),
-    Bit(
-        Quality.NEVER_UNLIT,
-        "Never in shadow: direct and global cannot be told apart.",
-        "Let the occluder or the pattern pass over this part too.",
-        (176, 77, 255),
-        fatal=True,
-    ),
-    Bit(
-        Quality.NEVER_LIT,
-        "Never seen with the source in full: direct is not known.",
-        "Let the occluder or the pattern leave this part free for some frames.",
-        (255, 0, 200),
-        fatal=True,
-    ),
-)
+class _Table(msgspec.Struct, forbid_unknown_fields=True):
+    bit: tuple[Bit, ...]
+
+
+def _read() -> tuple[Bit, ...]:
+    text = resources.files("daemon.products").joinpath("quality.toml").read_text("utf-8")
+    return msgspec.toml.decode(text, type=_Table).bit
+
+
+BITS = _read()
+"""In the order in which they are painted: the worse over the milder."""
 
 
 def overlay(
@@ -134,5 +70,5 @@ def overlay(
         if not flagged.any():
             continue
         opacity = np.sqrt(small(flagged.astype(np.float32)))[..., None] * np.float32(0.85)
-        painted += (np.asarray(bit.colour, dtype=np.float32) - painted) * opacity
+        painted += (np.asarray(bit.rgb, dtype=np.float32) - painted) * opacity
     return np.clip(painted, 0, 255).astype(np.uint8)

@@ -30,8 +30,8 @@ from daemon.pictures.preview import side_by_side
 from daemon.products import measured
 from daemon.products.quality import BITS, overlay
 from daemon.products.report.separation import Subject, render
+from daemon.separation.envelope import block_mean
 from daemon.separation.estimator import Components, Lighting, Measurement, Result
-from daemon.separation.single import block_mean
 from daemon.storage.durable import Damaged
 from daemon.storage.frames import FrameRecord, FrameStore, NoPixels
 from daemon.storage.runfolder import RunFolder

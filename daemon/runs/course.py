@@ -1,20 +1,25 @@
 """One run from its first step to its products, in a thread of its own.
 
     prepare -> (replay what an interruption left) -> steps -> products -> end
+       ^                                               │
+       └── a device has failed, and is waited for ─────┘
 
 What comes before the first frame is in `daemon.runs.preparation`, the steps are the sequencer's and
 the recorder's, what others are told meanwhile is in `daemon.runs.standing`; here it is decided what
 an end means: a failure keeps what was recorded, an abort leaves the devices safe, a full disk only
 pauses.
+
+Retry policy. Where the spec waits for what a run needs (`ready.deadline_s`), it waits again for a
+device that was lost or did not answer, and goes on as after an interruption: with a stage that is
+homed, and all frames that were recorded. A device that fails again and again before there is a new
+frame ends the run.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from datetime import datetime
 from typing import Any
 
 import structlog
@@ -26,21 +31,23 @@ from daemon.exposing.ahead import frames_ahead
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.control import Control
 from daemon.exposing.exposer import Behind
-from daemon.exposing.modes import Choice, Mode, choose
-from daemon.exposing.recorder import Exposed, Recorder, Tally
+from daemon.exposing.modes import Choice, choose
+from daemon.exposing.recorder import Exposed, Recorder
 from daemon.exposing.ring import Ring
-from daemon.exposing.sequencer import Sequencer, exposer_for
+from daemon.exposing.sequencer import Sequencer, exposer_for, ring_for
 from daemon.pictures.viewfinder import Viewfinder
 from daemon.products import separated
-from daemon.runs.ending import close, end_of, of_lost, requeue, utc_now, with_exposure
+from daemon.runs.ending import close, end_of, requeue, utc_now, with_exposure, without_result
 from daemon.runs.failures import as_error
 from daemon.runs.preparation import Preparation
+from daemon.runs.resuming import require_same_sun
 from daemon.runs.room import Room
 from daemon.runs.standing import Standing
 from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet, Result
 from daemon.storage.durable import StorageError
 from daemon.storage.frames import FrameStore
+from daemon.storage.ledger import Tally
 from daemon.storage.runfolder import RunFolder
 from daemon.storage.store import Store
 from drivers.base.camera import CameraInfo
@@ -53,10 +60,13 @@ from protocol.scans.occluded import OccluderScan
 from protocol.scans.projected import PatternScan
 
 _RESULT_S = 30.0
-TRUTH_S = 60.0
-SUN_DEG_PER_HOUR = 15.0
-_SEQUENCE_BYTES = 256 << 20
-"""Memory for the frames of hardware-timed sequences, where `ring_frames` are fewer."""
+"""Deadline of the estimator's result."""
+_TRUTH_S = 60.0
+"""Deadline of a simulated camera's truth, which it computes when it is asked."""
+
+_MENDS = {Code.DEVICE_LOST, Code.DEVICE_TIMEOUT, Code.DEVICE_GARBLED}
+_IN_VAIN = 3
+"""Failures of devices without a new frame between them, after which none is waited for."""
 
 log = structlog.get_logger(__name__)
 
@@ -86,7 +96,7 @@ class Course:
         self._room = Room(store, self.control)
         self._timings: dict[str, float] = {}
         self._reason = ""  # why the steps ended
-        self._broke_off = ""  # when an interrupted run took its last frame
+        self._failed_at: list[int] = []  # frames that were there when a device failed
 
     # ------------------------------------------------------------ for others
 
@@ -105,7 +115,6 @@ class Course:
     def execute(self) -> End:
         """Run to the end; never raises. The devices are safe when it returns."""
         structlog.contextvars.bind_contextvars(run=self.folder.id)
-        session: Session | None = None
         preparation = Preparation(
             self.folder,
             rig=self._rig,
@@ -117,6 +126,21 @@ class Course:
             on_look=self.standing.looking,
             beat=self.standing.live,
         )
+        while (end := self._attempt(preparation)) is None:
+            log.warning("the run waits for the device, and goes on")
+        begun = self.folder.file.state not in {RunState.QUEUED, RunState.WAITING}
+        if end is self.control.verdict and end.state is RunState.INTERRUPTED and not begun:
+            requeue(self.folder)
+        else:
+            close(self.folder, end, self._timings)
+        self.standing.changed()
+        return end
+
+    def _attempt(self, preparation: Preparation) -> End | None:
+        """Take the devices and go through to the end; None: one failed, and is waited for. The
+        devices are safe when it returns."""
+        session: Session | None = None
+        end: End | None = None
         try:
             session = self._rig.take(f"run {self.folder.id}")
             self.control.check(session)  # what came before there was a session to revoke
@@ -131,29 +155,33 @@ class Course:
             known = as_error(error)
             if known.code is Code.INTERNAL:
                 log.exception("run failed")
-            end = self.control.verdict or End(
-                state=RunState.FAILED, reason=known.message, code=known.code
-            )
+            end = self.control.verdict
+            if end is None and not self._waits_for(known):
+                end = End(state=RunState.FAILED, reason=known.message, code=known.code)
         finally:
             if session is not None:
                 # Whoever revoked the session has sent the devices there already: this waits.
                 futures = self._rig.make_safe(halt=not session.ended.is_set())
                 self._rig.safe_within(futures, SAFE_S)
-                preparation.restore()
+                if end is not None:
+                    preparation.restore()
                 self._rig.leave(session)
-        begun = self.folder.file.state not in {RunState.QUEUED, RunState.WAITING}
-        if end is self.control.verdict and end.state is RunState.INTERRUPTED and not begun:
-            requeue(self.folder)
-        else:
-            close(self.folder, end, self._timings)
-        self.standing.changed()
         return end
+
+    def _waits_for(self, error: UmbraError) -> bool:
+        """Whether the run goes on when what failed is there again."""
+        file = self.folder.file
+        if error.code not in _MENDS or not file.started or not file.spec.ready.deadline_s:
+            return False
+        log.warning("a device failed", problem=error.message)
+        self._failed_at.append(self._recorder.tally.taken if self._recorder else 0)
+        lately = self._failed_at[-_IN_VAIN:]
+        return len(lately) < _IN_VAIN or lately[0] < lately[-1]
 
     def _execute(self, session: Session, preparation: Preparation) -> End:
         began = time.monotonic()
         file = self.folder.file
         resuming = bool(file.started)
-        self._broke_off = self._last_frame() if resuming else ""
         prepared = preparation.prepare(session, resuming=resuming)
         method = prepared.method
         bench, exposure = prepared.bench, prepared.exposure
@@ -163,7 +191,7 @@ class Course:
         longest = 1.0
         if isinstance(file.spec, PatternScan) and file.spec.bracket is not None:
             longest = max(file.spec.bracket)
-        self.standing.begins(method, exposure_us * longest * 1e-6)
+        self.standing.begins(method.planned(), exposure_us * longest * 1e-6)
         rig = {**self._rig.snapshot(), "settings": prepared.settings}
         if exposure is not None:
             rig["exposure"] = exposure.facts()
@@ -178,23 +206,31 @@ class Course:
             rig=rig,
             bench=bench.recorded(),
             calibration=prepared.calibration,
+            estimates=prepared.estimates,
             sequencing=choice.facts(file.sequencing["counts"] if file.sequencing else {}),
         )
         if prepared.waited_s:
-            self._timings["waited_s"] = prepared.waited_s
-        frames = self._frames(info, resuming)
+            self._timings["waited_s"] = self._timings.get("waited_s", 0.0) + prepared.waited_s
+        frames = FrameStore.begin(
+            self.folder.path,
+            info.shape,
+            info.pixel_format.dtype,
+            pixels=self._config.storage.keep_frames,
+            resuming=resuming,
+        )
         try:
-            ring = self._ring(choice, bench, method.planned())
-            recorder = self._recorder = self.standing.recorder = Recorder(
+            least = self._config.sequencer.ring_frames
+            ring = ring_for(choice, bench, method.planned(), least)
+            recorder = self._recorder = self.standing.counts = Recorder(
                 method, frames, ring, self._taken, self._disk_full
             )
-            step, sub = self._replay(session, method, recorder, resuming)
+            start = self._replay(session, method, recorder, frames, resuming=resuming)
             recorder.start()
             self.standing.say("scanning")
             self._timings["prepare_s"] = time.monotonic() - began
             scanning = self._rig.clock.now_ns()
             try:
-                self._sequence(session, method, recorder, ring, choice, (step, sub))
+                self._sequence(session, method, recorder, ring, choice, start)
             except BaseException:
                 # Now, for the recorder may wait long for room.
                 self._rig.make_safe(halt=not session.ended.is_set())
@@ -209,7 +245,7 @@ class Course:
             self._timings["scan_s"] = (self._rig.clock.now_ns() - scanning) / NS
             truth = self._truth(session, _sources(file.spec, bench))
             self._rig.safe_within(self._rig.make_safe(halt=False), SAFE_S)
-            return self._conclude(recorder, info, truth)
+            return self._conclude(recorder, method, info, truth)
         finally:
             frames.close()
 
@@ -248,7 +284,7 @@ class Course:
     def _truth(self, session: Session, sources: tuple[str, ...]) -> dict[str, Any]:
         """What a simulated camera knows; a scan does not fail for the lack of it."""
         try:
-            return self._rig.camera.call(lambda c: c.truth(sources), TRUTH_S, session)
+            return self._rig.camera.call(lambda c: c.truth(sources), _TRUTH_S, session)
         except DeviceError as error:
             log.warning("no truth to compare with", problem=str(error))
             return {}
@@ -263,69 +299,31 @@ class Course:
             log.warning("exposure", problem=warning)
         return choice
 
-    def _ring(self, choice: Choice, bench: Bench, planned: int | None) -> Ring:
-        """The ring: of a sequence all frames are kept until it is known to be in step, and the one
-        before is being recorded meanwhile."""
-        info, limits = bench.camera, bench.projector.sequence if bench.projector else None
-        count = self._config.sequencer.ring_frames
-        if choice.mode is Mode.HARDWARE and limits is not None:
-            frame_bytes = math.prod(info.shape) * info.pixel_format.dtype.itemsize
-            wanted = 2 * min(limits.images, planned or limits.images)
-            count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
-        return Ring(count, info.shape, info.pixel_format.dtype)
-
-    def _frames(self, info: CameraInfo, resuming: bool) -> FrameStore:
-        if resuming and (self.folder.path / "frames.jsonl").exists():
-            return FrameStore.open(self.folder.path)
-        return FrameStore.create(
-            self.folder.path,
-            info.shape,
-            info.pixel_format.dtype,
-            pixels=self._config.storage.keep_frames,
-        )
-
     def _replayed(self, session: Session) -> None:
         """A frame of before has been taken in: a sign of life, and the place to be aborted."""
         self.standing.replayed()
         self.control.check(session)
 
     def _replay(
-        self, session: Session, method: Method[Any], recorder: Recorder, resuming: bool
+        self,
+        session: Session,
+        method: Method[Any],
+        recorder: Recorder,
+        frames: FrameStore,
+        *,
+        resuming: bool,
     ) -> tuple[int, int]:
+        """Take in what was recorded before an interruption; the step and sub-index to begin with.
+        Raises UmbraError(unsuitable) where the sun has moved on."""
         with closing(frames_ahead(self._rig.camera, session, self.standing.live)) as ahead:
             method.foresee(ahead)
         if not resuming:
             return 0, 0
         self.standing.say("taking in what was recorded before the interruption")
-        self._same_sun()
+        require_same_sun(self.folder, frames.records(), self._rig.clock.utc_ns())
         step, sub = recorder.replay(lambda: self._replayed(session))
         log.info("resumed", step=step, sub=sub, recorded=recorder.tally.recorded)
         return step, sub
-
-    def _last_frame(self) -> str:
-        """When the last frame was taken that is recorded, ISO 8601; "": there is none."""
-        if not (self.folder.path / "frames.jsonl").exists():
-            return ""
-        store = FrameStore.open(self.folder.path, readonly=True)
-        try:
-            return max((record.utc for record in store.records()), default="")
-        finally:
-            store.close()
-
-    def _same_sun(self) -> None:
-        """A scan under the sun is not resumed when the sun has gone on: shadows and shading with
-        it. Raises UmbraError(unsuitable)."""
-        spec, ended = self.folder.file.spec, self._broke_off
-        if not isinstance(spec, OccluderScan) or not spec.sun or not ended:
-            return
-        away_s = self._rig.clock.utc_ns() / NS - datetime.fromisoformat(ended).timestamp()
-        gone = away_s / 3600.0 * SUN_DEG_PER_HOUR
-        if gone > spec.drift_deg:
-            raise UmbraError(
-                Code.UNSUITABLE,
-                f"{self.folder.id} cannot be resumed: the sun has gone {gone:.1f} degrees since it "
-                f"broke off, and {spec.drift_deg:g} are allowed (--drift-deg); scan again",
-            )
 
     # ------------------------------------------------------------ during
 
@@ -373,22 +371,22 @@ class Course:
             recorded=tally.recorded,
             missing=tally.missing,
             rejected=tally.rejected,
-            sequencing=choice.facts(recorder.exposing),
+            sequencing=choice.facts(recorder.ledger.exposing),
         )
 
     # ------------------------------------------------------------ after
 
-    def _conclude(self, recorder: Recorder, info: CameraInfo, truth: Mapping[str, Any]) -> End:
+    def _conclude(
+        self, recorder: Recorder, method: Method[Any], info: CameraInfo, truth: Mapping[str, Any]
+    ) -> End:
         self.standing.update(state=RunState.FINISHING)
         self.standing.say("writing products")
         began = time.monotonic()
-        lost = recorder.lost_patterns
+        lost = recorder.ledger.lost_patterns
         try:
             result = with_exposure(recorder.result(_RESULT_S), self.folder.file.rig)
-        except NotYet:
-            if lost:
-                raise UmbraError(Code.FRAMES_MISSING, f"{of_lost(lost)}: scan again") from None
-            raise
+        except NotYet as error:
+            raise without_result(error, recorder.ledger, self._reason) from None
         self._timings["separate_s"] = time.monotonic() - began
         made = separated.write(
             self.folder,
@@ -401,7 +399,7 @@ class Course:
         )
         self.folder.add_products(made)
         self._timings["products_s"] = time.monotonic() - began
-        return end_of(lost, self._reason)
+        return end_of(lost, self._reason, short=method.short())
 
 
 def _sources(spec: AnyScan, bench: Bench) -> tuple[str, ...]:

@@ -9,7 +9,8 @@ from typing import Any
 
 import structlog
 
-from daemon.separation.estimator import Result
+from daemon.separation.estimator import NotYet, Result
+from daemon.storage.ledger import Ledger
 from daemon.storage.runfolder import RunFolder
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import End, RunState
@@ -34,16 +35,16 @@ def with_exposure(result: Result, rig: Mapping[str, Any]) -> Result:
     return replace(result, facts=facts)
 
 
-def end_of(lost: Mapping[int, str], reason: str) -> End:
+def end_of(lost: Mapping[int, str], reason: str, *, short: bool = False) -> End:
     """The end of a run whose products are made; `lost` are patterns that it has no frame of, and
-    why."""
-    if not lost:
+    why; `short`: it ended for its reason before it had what was asked for (`Method.short`)."""
+    if lost:
+        reason = f"{of_lost(lost)}; the products are made without them"
+    elif short:
+        reason += "; the products are made of the frames that came, and `umbra resume` adds to them"
+    else:
         return End(state=RunState.DONE, reason=reason)
-    return End(
-        state=RunState.FAILED,
-        code=Code.FRAMES_MISSING,
-        reason=f"{of_lost(lost)}; the products are made without them",
-    )
+    return End(state=RunState.FAILED, code=Code.FRAMES_MISSING, reason=reason)
 
 
 def of_lost(lost: Mapping[int, str]) -> str:
@@ -51,6 +52,22 @@ def of_lost(lost: Mapping[int, str]) -> str:
     some = ", ".join(str(n) for n in list(lost)[:8]) + (" ..." if len(lost) > 8 else "")
     why = list(lost.values())[-1]
     return f"no frame could be had of {len(lost)} of the patterns ({some}): {why}"
+
+
+def without_result(error: NotYet, ledger: Ledger, reason: str) -> UmbraError:
+    """Why a run that came to its end has nothing to show: what is lacking, why it ended then, and
+    what became of its frames."""
+    lost, tally = ledger.lost_patterns, ledger.tally
+    if lost:
+        return UmbraError(Code.FRAMES_MISSING, f"{of_lost(lost)}: scan again")
+    frames = f"{tally.recorded} frames were recorded"
+    if tally.missing:
+        frames += f" and {tally.missing} are missing"
+    if tally.rejected:
+        frames += f"; {tally.rejected} were not used, the last for: {ledger.why_unused}"
+    return UmbraError(
+        Code.NO_RESULT, f"there is no result: {error}. It ended for: {reason}. {frames}"
+    )
 
 
 def requeue(folder: RunFolder) -> None:

@@ -35,7 +35,7 @@ _MENDS = {
     Code.STORAGE_FULL,
     Code.NOT_READY,
 }
-_STEADY_LOOKS = 3
+_STEADY_LOOKS = 3  # that must agree for light to be steady
 
 log = structlog.get_logger(__name__)
 
@@ -136,7 +136,7 @@ class Preconditions:
 
 
 class LightWatch:
-    """Looks at the light, no more often than `look_s`, and what they say of it."""
+    """Looks at the light, at most once in `look_s`, and judges what it saw."""
 
     def __init__(self, wanted: Ready, look: Callable[[], Level], clock: Clock) -> None:
         """`look` takes a picture; see `daemon.separation.metering`."""
@@ -147,7 +147,7 @@ class LightWatch:
         self._seen: deque[Level] = deque(maxlen=_STEADY_LOOKS)
 
     def conditions(self) -> list[Precondition]:
-        """Those that are wanted."""
+        """The conditions on light that the scan asks for."""
         wanted = self._wanted
         found = []
         if wanted.light_min is not None or wanted.light_max is not None:

@@ -25,9 +25,10 @@ from daemon.exposing.motion import require_homed
 from daemon.pictures.viewfinder import Viewfinder
 from daemon.runs.calibration import Calibrations
 from daemon.runs.preconditions import LightWatch, Precondition, Preconditions
+from daemon.runs.resuming import require_same_devices
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Bench, Method
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import response_of
 from daemon.separation.metering import Exposure, Level
 from daemon.storage.runfolder import RunFolder
 from daemon.storage.store import Store, estimate_bytes
@@ -45,13 +46,15 @@ log = structlog.get_logger(__name__)
 @dataclass(frozen=True, slots=True)
 class Prepared:
     """What a run begins with. `settings` are the camera's in force, JSON-able, as run.json keeps
-    them; `exposure` where it was chosen by pictures."""
+    them; `exposure` where it was chosen by pictures; `estimates` of frames and bytes, where
+    the plan knows."""
 
     method: Method[Any]
     bench: Bench
     settings: dict[str, Any]
     calibration: dict[str, Any]
     exposure: Exposure | None
+    estimates: dict[str, float]
     waited_s: float
 
 
@@ -93,16 +96,18 @@ class Preparation:
         wanted = self._wanted(before)
         metered = spec.auto_exposure and not (before or {}).get("settings")
         exposure: Exposure | None = None
+        estimates: dict[str, float] = {}
 
         def devices() -> None:
             self._rig.require_ready()
             require_meterable(spec, self._rig.bench())
             if before is not None:
-                self._same_devices(before)
+                require_same_devices(self._folder, before, self._rig.snapshot())
             self._settings = self._configure(session, wanted)
 
         def disk() -> None:
-            self._room(method_for(spec, self._rig.bench()).planned())
+            nonlocal estimates
+            estimates = self._room(method_for(spec, self._rig.bench()).planned())
 
         def stage() -> None:
             if isinstance(spec, OccluderScan) and self._rig.stage is not None:
@@ -142,6 +147,7 @@ class Preparation:
             settings=self._settings,
             calibration=calibration,
             exposure=exposure,
+            estimates=estimates,
             waited_s=waited_s,
         )
 
@@ -184,19 +190,9 @@ class Preparation:
             "pixel_format": camera.device.info().pixel_format.value,
         }
 
-    def _same_devices(self, before: Mapping[str, Any]) -> None:
-        """An interrupted run goes on with the devices that it began with, or not at all."""
-        for name, now in self._rig.snapshot().items():
-            then = before.get(name)
-            if then is None or (then["model"], then["serial"]) != (now["model"], now["serial"]):
-                raise UmbraError(
-                    Code.UNSUITABLE,
-                    f"{self._folder.id} cannot be resumed: its {name} was "
-                    f"{then and then['model']} {then and then['serial']}, "
-                    f"now it is {now['model']} {now['serial']}; scan again",
-                )
-
-    def _room(self, planned: int | None) -> None:
+    def _room(self, planned: int | None) -> dict[str, float]:
+        """What the run is expected to take. Raises UmbraError(storage_full) where there is no room
+        for it."""
         info = self._rig.camera.device.info()
         need = estimate_bytes(
             info.shape, info.pixel_format.dtype, planned or 1, self._config.storage.keep_frames
@@ -207,6 +203,7 @@ class Preparation:
                 f"{self._config.rig.data}: the scan needs about {need / 1e6:.0f} MB beyond the "
                 f"reserve, {self._store.free_bytes() / 1e6:.0f} MB are free: delete old runs",
             )
+        return {} if planned is None else {"frames": float(planned), "bytes": float(need)}
 
     # ------------------------------------------------------------ the light
 

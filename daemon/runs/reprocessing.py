@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import count, takewhile
 from typing import Any
@@ -22,26 +21,36 @@ import msgspec
 import structlog
 
 from daemon.exposing.control import Control
-from daemon.exposing.recorder import Tally
+from daemon.exposing.unusable import named
 from daemon.products import separated
 from daemon.runs.ending import close, end_of, utc_now, with_exposure
 from daemon.runs.failures import as_error
 from daemon.runs.preparation import as_exposed
+from daemon.runs.standing import Standing
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Bench, Circle, Expose, Method, Step, Taken, Unsuitable, Watch
-from daemon.scans.occluder import INCOMPLETE
+from daemon.scans.method import (
+    INCOMPLETE,
+    Bench,
+    Circle,
+    Expose,
+    Method,
+    Step,
+    Taken,
+    Unsuitable,
+    Watch,
+)
 from daemon.separation.estimator import Components, NotYet, Result
 from daemon.storage.durable import storage
 from daemon.storage.frames import ARRAY, LINES, FrameRecord, FrameStore
+from daemon.storage.ledger import Ledger, Tally
 from daemon.storage.runfolder import RunFile, RunFolder
 from daemon.storage.store import Store, estimate_bytes
+from drivers.clock import RealClock
 from protocol.errors import Code, UmbraError
 from protocol.messages.runs import End, Progress, RunState
 from protocol.scans.anyscan import AnyScan
 from protocol.scans.occluded import Mesh
 
-_PROGRESS_S = 0.1
-_RATE_FRAMES = 20
 _SHARE = 0.25
 """Of its thread's time while a scan is under way: the scan's frames cannot wait, these can."""
 _GROUP_FRAMES = 256
@@ -68,39 +77,23 @@ class Reprocessing:
     ) -> None:
         """`busy` says whether a scan is under way, which is to be left the machine."""
         self.folder = folder
-        self._busy = busy
         self.control = Control()
+        self.standing = Standing(folder, RealClock(), on_change=on_change, on_progress=on_progress)
+        self.standing.counts = self
+        self.summary: Mapping[str, float] = {}
+        self._ledger = Ledger()
+        self._busy = busy
         self._store = store
-        self._on_change = on_change
-        self._on_progress = on_progress
         self._estimating = threading.Lock()
         self._conclude: Callable[[], Result] | None = None
-        self._summary: Mapping[str, float] = {}
-        self._tally = Tally()
-        self._frames = 0  # of the parent, missing ones included
-        self._phase = "preparing"
-        self._moments: deque[tuple[float, int]] = deque(maxlen=_RATE_FRAMES + 1)
-        self._told = 0.0
         self._timings: dict[str, float] = {}
 
     # ------------------------------------------------------------ for others
 
-    def progress(self) -> Progress:
-        """How far it is, now."""
-        rate, taken = self._rate(), self._tally.taken
-        return Progress(
-            run=self.folder.id,
-            state=self.folder.file.state,
-            recorded=self._tally.recorded,
-            planned=self._frames or None,
-            missing=self._tally.missing,
-            rejected=self._tally.rejected,
-            fraction=taken / self._frames if self._frames else None,
-            rate_hz=rate,
-            remaining_s=(self._frames - taken) / rate if rate else None,
-            phase=self._phase,
-            summary=dict(self._summary),
-        )
+    @property
+    def tally(self) -> Tally:
+        """What has become of the parent's frames so far."""
+        return self._ledger.tally
 
     def result(self) -> Result:
         """The result from the frames so far. Raises UmbraError(no_result)."""
@@ -111,12 +104,6 @@ class Reprocessing:
             return conclude()
         except NotYet as error:
             raise UmbraError(Code.NO_RESULT, str(error)) from error
-
-    def _rate(self) -> float:
-        moments = list(self._moments)
-        if len(moments) < 2 or moments[-1][0] == moments[0][0]:
-            return 0.0
-        return (moments[-1][1] - moments[0][1]) / (moments[-1][0] - moments[0][0])
 
     # ------------------------------------------------------------ the thread
 
@@ -133,7 +120,7 @@ class Reprocessing:
                 log.exception("reprocessing failed")
             end = End(state=RunState.FAILED, reason=known.message, code=known.code)
         close(self.folder, end, self._timings)
-        self._on_change()
+        self.standing.changed()
         return end
 
     def _execute(self) -> End:
@@ -141,8 +128,8 @@ class Reprocessing:
         file = self.folder.file
         source = source_of(self.folder, self._store)
         method, again = method_of(file, source.file)
-        self._update(state=RunState.RUNNING, started=utc_now(), ended="", end=None)
-        self._say("reading the frames of " + source.id)
+        self.standing.update(state=RunState.RUNNING, started=utc_now(), ended="", end=None)
+        self.standing.say("reading the frames of " + source.id)
         frames = frames_of(source)
         if not self._store.room_for(estimate_bytes(*_form(frames), len(frames), pixels=False)):
             raise UmbraError(
@@ -152,14 +139,14 @@ class Reprocessing:
             )
         if again:
             log.info("what each frame is used for is decided again")
-        self._frames = len(frames)
+        self.standing.begins(len(frames))
         own = self._records(frames)
         try:
             lost = self._take_in(frames, own, method, again=again)
         finally:
             own.close()
             frames.close()
-            tally = self._tally
+            tally = self.tally
             self.folder.update(
                 recorded=tally.recorded, missing=tally.missing, rejected=tally.rejected
             )
@@ -188,7 +175,6 @@ class Reprocessing:
         if method.bench.camera.recorded:
             records = frames.records()[: len(frames)]
             method.foresee(frames.read(r.index) for r in records if not r.missing)
-        missing, seen = dict[int, str](), set[int]()
         scratch = None
         at: tuple[int, Step] | None = None
         for record in frames.records()[: len(frames)]:  # it may be resumed meanwhile
@@ -196,38 +182,34 @@ class Reprocessing:
             if self.control.verdict is not None:
                 raise _Ended
             if at is None or record.step != at[0]:
-                at = record.step, _as_shown(method, record, self._summary)
+                at = record.step, _as_shown(method, record, self.summary)
             step = at[1]
-            tally = self._tally
             if record.missing:
-                missing[record.observation.pattern] = record.missing
                 method.observe(step, _taken(record, None))  # as when it did not come
-                own.append_missing(record)
-                self._tally = Tally(tally.recorded, tally.missing + 1, tally.rejected)
-                self._taken()
+                self._note(own.append_missing(record))
                 continue
             scratch = frames.read(record.index, out=scratch)
-            if again:
-                observation = method.observe(step, _taken(record, scratch))
-            else:
-                observation = record.observation
-                method.recall(scratch, observation)
-            own.append(scratch, msgspec.structs.replace(record, observation=observation))
-            with self._estimating:
+            with named(record.index, record.source):
+                if again:
+                    observation = method.observe(step, _taken(record, scratch))
+                else:
+                    observation = record.observation
+                    method.recall(scratch, observation)
+            kept = own.append(scratch, msgspec.structs.replace(record, observation=observation))
+            with self._estimating, named(record.index, record.source):
                 estimator.update(scratch, observation)
-                self._summary = estimator.summary()
+                self.summary = estimator.summary()
             self._conclude = conclude
-            if observation.used:
-                seen.add(observation.pattern)
-            self._tally = Tally(
-                tally.recorded + 1, tally.missing, tally.rejected + (not observation.used)
-            )
             if len(own) % _GROUP_FRAMES == 0:
                 own.commit()
-            self._taken()
+            self._note(kept)
             self._give_way(time.monotonic() - began)
         own.commit()
-        return {pattern: why for pattern, why in sorted(missing.items()) if pattern not in seen}
+        return self._ledger.lost_patterns
+
+    def _note(self, record: FrameRecord) -> None:
+        self._ledger.note(record)
+        self.standing.taken(self.tally)
 
     def _give_way(self, took_s: float) -> None:
         """After a frame that took so long: beside a scan, leave it the rest of the time."""
@@ -238,8 +220,8 @@ class Reprocessing:
         file = self.folder.file
         if self._conclude is None:
             raise UmbraError(Code.NO_RESULT, f"{source.id} has no frames: scan again")
-        self._update(state=RunState.FINISHING)
-        self._say("writing products")
+        self.standing.update(state=RunState.FINISHING)
+        self.standing.say("writing products")
         began = time.monotonic()
         result = with_exposure(self._conclude(), file.rig)
         self._timings["separate_s"] = time.monotonic() - began
@@ -255,23 +237,6 @@ class Reprocessing:
         self.folder.add_products(made)
         self._timings["products_s"] = time.monotonic() - began
         return end_of(lost, f"made from {file.parents[0]}")
-
-    # ------------------------------------------------------------ telling
-
-    def _taken(self) -> None:
-        now = time.monotonic()
-        self._moments.append((now, self._tally.taken))
-        if now - self._told >= _PROGRESS_S or self._tally.taken == self._frames:
-            self._told = now
-            self._on_progress(self.progress())
-
-    def _say(self, phase: str) -> None:
-        self._phase = phase
-        self._on_progress(self.progress())
-
-    def _update(self, **changes: Any) -> None:
-        self.folder.update(**changes)
-        self._on_change()
 
 
 # ---------------------------------------------------------------- what is to be read, and how

@@ -9,7 +9,7 @@ from daemon.storage.durable import StorageError
 from daemon.storage.store import Store
 from protocol.errors import Code, UmbraError
 
-_LOOK_S = 1.0
+_LOOK_S = 1.0  # from one look at the disk to the next
 
 
 class Room:

@@ -1,14 +1,12 @@
 """The queue, and the life of a run: which one is next, and what people may do to it.
 
-Commands may come from any thread; runs are begun from the loop only, and the course of the current
-one is a thread of its own.
+Commands may come from any thread; runs are begun from the loop only (`RunLoop`).
 """
 
 from __future__ import annotations
 
-import asyncio
-import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from typing import ClassVar
 
 import structlog
 
@@ -17,10 +15,10 @@ from daemon.devices.lightmeter import require_meterable
 from daemon.devices.rig import Rig
 from daemon.exposing.modes import choose
 from daemon.pictures.viewfinder import Viewfinder
-from daemon.runs import aftermath
 from daemon.runs.course import Course
 from daemon.runs.ending import utc_now
 from daemon.runs.failures import as_error
+from daemon.runs.runloop import RunLoop, require_queued, wrong_state
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Unsuitable
 from daemon.storage.frames import count
@@ -29,19 +27,14 @@ from daemon.storage.store import Store
 from drivers.base.errors import DeviceError
 from protocol.errors import Code, UmbraError
 from protocol.messages.events import AnyEvent, Progressed, QueueChanged, RunChanged
-from protocol.messages.runs import End, Progress, RunState
+from protocol.messages.runs import End, RunState
 from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import OccluderScan
 
 _UNFINISHED = {RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}
-_RESUMABLE_CODES = {
-    Code.DEVICE_LOST,
-    Code.DEVICE_TIMEOUT,
-    Code.DEVICE_REFUSED,
-    Code.DEVICE_GARBLED,
-    Code.STORAGE_FULL,
-    Code.STORAGE_FAILED,
-    Code.NOT_READY,
-}
+
+_TOO_FEW = {Code.FRAMES_MISSING, Code.NO_RESULT}
+"""What a video fails with that goes on where it ended, if it is resumed."""
 
 LOCK = "lock"
 """A reason to hold the queue, except for runs of whoever holds the rig."""
@@ -49,8 +42,18 @@ LOCK = "lock"
 log = structlog.get_logger(__name__)
 
 
-class Runner:
+class Runner(RunLoop[Course]):
     """Runs what is queued, one at a time, in order; everything it knows is in the store."""
+
+    resumable: ClassVar[Collection[Code]] = {
+        Code.DEVICE_LOST,
+        Code.DEVICE_TIMEOUT,
+        Code.DEVICE_REFUSED,
+        Code.DEVICE_GARBLED,
+        Code.STORAGE_FULL,
+        Code.STORAGE_FAILED,
+        Code.NOT_READY,
+    }
 
     def __init__(
         self,
@@ -65,21 +68,15 @@ class Runner:
     ) -> None:
         """`publish` and `on_activity` must be safe to call from any thread; `make_way` ends manual
         work before a run and may block."""
+        super().__init__(store, config, thread="umbra-sequencer")
         self._rig = rig
-        self._store = store
-        self._config = config
         self._viewfinder = viewfinder
         self._publish = publish
         self._on_activity = on_activity
         self._make_way = make_way
-        self._course: Course | None = None
-        self._wake = asyncio.Event()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._choosing = threading.Lock()  # a run is begun or taken from the queue, never both
         self._held: set[str] = set()
         self._of_holder: set[str] = set()  # runs submitted by whoever holds the rig
         self._unwritten: set[str] = set()  # runs whose state a full disk has refused
-        self._stopping = False
 
     # ------------------------------------------------------------ the loop
 
@@ -98,9 +95,9 @@ class Runner:
                     state=RunState.INTERRUPTED,
                     ended=utc_now(),
                     end=end,
-                    recorded=found.recorded,
-                    missing=found.missing,
-                    sequencing=how and {**how, "counts": found.exposing},
+                    recorded=found.tally.recorded,
+                    missing=found.tally.missing,
+                    sequencing=how and {**how, "counts": dict(found.exposing)},
                 )
                 log.warning("run interrupted", run=run.id)
         self.tend()
@@ -120,27 +117,11 @@ class Runner:
                 else:
                     self._unwritten.discard(run.id)
 
-    async def serve(self) -> None:
-        """Run what is queued until `stop`."""
-        self._loop = asyncio.get_running_loop()
-        while not self._stopping:
-            self._wake.clear()
-            with self._choosing:
-                course = self._begin()
-            if course is None:
-                await self._wake.wait()
-                continue
-            await self._run(course)
-            del course  # and with it its frames and planes
-            await asyncio.to_thread(aftermath.give_back)
-
     def wake(self) -> None:
         """Look again whether a run can begin, or go on that waits; from any thread."""
-        course = self._course
-        if course is not None:
+        if (course := self._execution) is not None:
             course.control.news.set()
-        if self._loop is not None:
-            self._loop.call_soon_threadsafe(self._wake.set)
+        super().wake()
 
     @property
     def waits_for(self) -> str:
@@ -152,27 +133,6 @@ class Runner:
         except UmbraError as error:
             return error.message
         return ", ".join(sorted(self._held))
-
-    def _begin(self) -> Course | None:
-        """The course of the next run that may begin, if there is one; it is current from now on."""
-        run = self._next()
-        if run is None:
-            return None
-        self._course = Course(
-            run,
-            rig=self._rig,
-            store=self._store,
-            config=self._config,
-            viewfinder=self._viewfinder,
-            on_change=lambda: self._changed(run),
-            on_progress=lambda p: self._publish(Progressed(progress=p)),
-        )
-        return self._course
-
-    def _changed(self, run: RunFolder) -> None:
-        """The run under way has another state, and the rig with it."""
-        self._publish(RunChanged(run=run.info()))
-        self._on_activity()
 
     def _next(self) -> RunFolder | None:
         if self._stopping or self._held - {LOCK}:
@@ -186,26 +146,28 @@ class Runner:
             return None  # a device that is away fails no run that has not begun
         return waiting[0]
 
-    async def _run(self, course: Course) -> None:
-        loop = asyncio.get_running_loop()
-        ended = loop.create_future()
+    def _execution_of(self, run: RunFolder) -> Course:
+        def changed() -> None:
+            self._publish(RunChanged(run=run.info()))
+            self._on_activity()  # the rig's state is another one with it
 
-        def execute() -> None:
-            try:
-                self._clear_the_way()
-                course.execute()
-            finally:
-                loop.call_soon_threadsafe(ended.set_result, None)
+        return Course(
+            run,
+            rig=self._rig,
+            store=self._store,
+            config=self._config,
+            viewfinder=self._viewfinder,
+            on_change=changed,
+            on_progress=lambda p: self._publish(Progressed(progress=p)),
+        )
 
+    def _execute(self, execution: Course) -> None:
+        log.info("run begins", run=execution.folder.id)
         self._on_activity()
-        log.info("run begins", run=course.folder.id)
-        thread = threading.Thread(target=execute, name="umbra-sequencer")
-        thread.start()
-        await ended
-        thread.join()
-        self._course = None
-        if not self._stopping:
-            await asyncio.to_thread(aftermath.after, course.folder, self._store, self._config)
+        self._clear_the_way()
+        execution.execute()
+
+    def _ended(self) -> None:
         self._publish(QueueChanged(queue=tuple(r.id for r in self.queue())))
         self._on_activity()
 
@@ -218,12 +180,10 @@ class Runner:
 
     def stop(self) -> None:
         """For shutdown: the current run is interrupted, and can be resumed after a restart."""
-        self._stopping = True
-        course = self._active
-        if course is not None:
+        super().stop()
+        if (course := self.under_way) is not None:
             course.control.end(RunState.INTERRUPTED, "umbrad was stopped; `umbra resume` goes on")
             self._rig.make_safe()
-        self._wake.set()
 
     def hold(self, why: str) -> None:
         """Begin no run for as long as `why` is not released; during a LOCK only its holder's."""
@@ -240,36 +200,22 @@ class Runner:
 
     def end_for_estop(self, by: str) -> None:
         """The devices have been stopped: the current run ends as aborted."""
-        if self._course is not None:
-            self._course.control.end(RunState.ABORTED, "emergency stop", by=by)
+        if self._execution is not None:
+            self._execution.control.end(RunState.ABORTED, "emergency stop", by=by)
 
     # ------------------------------------------------------------ what is going on
 
     @property
     def alive(self) -> bool:
         """Whether the run under way, if any, has moved lately (the watchdog's question)."""
-        return self._active is None or self._active.standing.alive
+        course = self.under_way
+        return course is None or course.standing.alive
 
     @property
     def current(self) -> RunFolder | None:
         """The run under way."""
-        return self._active.folder if self._active else None
-
-    @property
-    def _active(self) -> Course | None:
-        """The course, unless its run has ended and only the loop has not heard of it yet."""
-        course = self._course
-        return None if course is None or course.folder.file.state.ended else course
-
-    @property
-    def course(self) -> Course | None:
-        """The course of the run under way."""
-        return self._active
-
-    @property
-    def progress(self) -> Progress | None:
-        """How far the run under way is."""
-        return self._active.standing.progress() if self._active else None
+        course = self.under_way
+        return course.folder if course else None
 
     def queue(self) -> list[RunFolder]:
         """The runs that wait, the next first."""
@@ -280,8 +226,8 @@ class Runner:
         """A run by its id; "" is the current, else the newest. Raises UmbraError(unknown_run)."""
         if run:
             return self._store.open(run)
-        if self._active is not None:
-            return self._active.folder
+        if (current := self.current) is not None:
+            return current
         newest = next(iter(self._store.runs()), None)
         if newest is None:
             raise UmbraError(Code.UNKNOWN_RUN, "there is no run yet; `umbra scan` makes one")
@@ -322,7 +268,8 @@ class Runner:
 
     def move(self, run: str, to: int) -> list[RunFolder]:
         """Put a waiting run at another place; gives the new queue."""
-        moved = self._waiting(run, "moved in the queue")
+        moved = self._store.open(run)
+        require_queued(moved, "moved in the queue")
         rest = [r for r in self.queue() if r.id != moved.id]
         rest.insert(min(to, len(rest)), moved)
         for order, waiting in enumerate(rest):
@@ -335,13 +282,13 @@ class Runner:
         """Pause the current run after the step under way."""
         course = self._running(run)
         if course.folder.file.state is not RunState.RUNNING:
-            raise self._wrong_state(course.folder, "paused")
+            raise wrong_state(course.folder, "paused")
         course.control.pause("asked for by an operator")
         return course.folder
 
     def resume(self, run: str) -> RunFolder:
         """Go on with the paused run, or queue an interrupted one again, ahead of the others."""
-        course = self._active
+        course = self.under_way
         if not run and course is None:
             raise UmbraError(
                 Code.WRONG_STATE, "no run is paused; name the interrupted one: `umbra resume RUN`"
@@ -350,10 +297,7 @@ class Runner:
         if course is not None and folder.id == course.folder.id:
             course.resumed()
             return folder
-        file = folder.file
-        broke = file.state is RunState.FAILED and file.end and file.end.code in _RESUMABLE_CODES
-        if file.state is not RunState.INTERRUPTED and not broke:
-            raise self._wrong_state(folder, "resumed")
+        self._require_resumable(folder)
         orders = [r.file.order for r in self._store.queued()] or [0]
         folder.update(state=RunState.QUEUED, order=min(orders) - 1)
         self._queue_changed(folder)
@@ -362,7 +306,7 @@ class Runner:
     def abort_current(self, run: str, by: str) -> RunFolder | None:
         """End the run under way, if it is this one; the devices go to their safe state at once.
         Never blocks."""
-        course = self._active
+        course = self.under_way
         if course is None or run not in {"", course.folder.id}:
             return None
         if course.folder.file.state is RunState.FINISHING:
@@ -384,28 +328,25 @@ class Runner:
         with self._choosing:
             if (current := self.abort_current(run, by)) is not None:  # it has begun meanwhile
                 return current
-            waiting = self._waiting(run, "aborted")
-            end = End(state=RunState.ABORTED, reason="taken from the queue", by=by)
-            waiting.update(state=RunState.ABORTED, end=end, ended=utc_now())
+            waiting = self._store.open(run)
+            self._take_from_queue(waiting, by)
         self._queue_changed(waiting)
         return waiting
 
     def _running(self, run: str) -> Course:
-        course = self._active
+        course = self.under_way
         if course is None or run not in {"", course.folder.id}:
             if run:
-                raise self._wrong_state(self._store.open(run), "paused")
+                raise wrong_state(self._store.open(run), "paused")
             raise UmbraError(Code.WRONG_STATE, "no run is under way")
         return course
 
-    def _waiting(self, run: str, done: str) -> RunFolder:
-        folder = self._store.open(run)
-        if folder.file.state is not RunState.QUEUED:
-            raise self._wrong_state(folder, done)
-        return folder
-
-    def _wrong_state(self, run: RunFolder, done: str) -> UmbraError:
-        return UmbraError(Code.WRONG_STATE, f"{run.id} is {run.file.state}: it cannot be {done}")
+    def _require_resumable(self, run: RunFolder) -> None:
+        """Raise UmbraError(wrong_state) unless there is something left to be done in it."""
+        file = run.file
+        ended = file.end.code if file.end and file.state is RunState.FAILED else ""
+        if not (isinstance(file.spec, OccluderScan) and ended in _TOO_FEW):
+            super()._require_resumable(run)
 
     def _queue_changed(self, run: RunFolder) -> None:
         self._publish(RunChanged(run=run.info()))

@@ -4,22 +4,36 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
-from daemon.exposing.recorder import Recorder, Tally
-from daemon.scans.method import Method
 from daemon.storage.durable import StorageError
+from daemon.storage.ledger import Tally
 from daemon.storage.runfolder import RunFolder
 from drivers.clock import NS, Clock
 from protocol.errors import Code
 from protocol.messages.runs import Progress, RunState, Waiting
 
 _PROGRESS_S = 0.1
+"""Progress is told no more often."""
 _RATE_FRAMES = 20
-_CONCLUDE_S = 600.0
+"""The rate is that of so many frames, the last ones."""
 _STILL_S = 60.0
 """A scan that shows no sign of life for so long hangs: every wait in it has a shorter deadline."""
+_CONCLUDE_S = 600.0
+"""The same while products are written, which gives no sign of life until it is done."""
+
+
+class Counts(Protocol):
+    """Whoever counts a run's frames: its `Recorder`, or its `Reprocessing`."""
+
+    @property
+    def tally(self) -> Tally:
+        """What has become of the frames so far."""
+
+    @property
+    def summary(self) -> Mapping[str, float]:
+        """The estimator's figures so far."""
 
 
 class Standing:
@@ -34,12 +48,12 @@ class Standing:
         on_progress: Callable[[Progress], None],
     ) -> None:
         """Both are called from whatever thread has something to tell."""
-        self.recorder: Recorder | None = None
+        self.counts: Counts | None = None  # until there are frames to count
         self._folder = folder
         self._clock = clock
         self._on_change = on_change
         self._on_progress = on_progress
-        self._method: Method[Any] | None = None
+        self._planned: int | None = None
         self._phase = "preparing"
         self._waits: Waiting | None = None
         self._moments: deque[tuple[int, int]] = deque(maxlen=_RATE_FRAMES + 1)
@@ -51,10 +65,9 @@ class Standing:
 
     def progress(self) -> Progress:
         """How far it is, now."""
-        recorder, method = self.recorder, self._method
-        tally = recorder.tally if recorder else Tally()
-        summary = dict(recorder.summary) if recorder else {}
-        planned = method.planned() if method else None
+        counts, planned = self.counts, self._planned
+        tally = counts.tally if counts else Tally()
+        summary = dict(counts.summary) if counts else {}
         fraction = summary.get("coverage") if planned is None else tally.taken / max(planned, 1)
         rate = self.rate()
         left = None if planned is None or not rate else max(0, planned - tally.taken) / rate
@@ -108,14 +121,15 @@ class Standing:
             self.note(state=RunState.WAITING)
         self.say(f"waiting for {waits.what}: {waits.seen}")
 
-    def begins(self, method: Method[Any], exposure_s: float) -> None:
-        """It waits no more; `exposure_s` is its longest exposure."""
-        self._method, self._exposure_s, self._waits = method, exposure_s, None
+    def begins(self, planned: int | None, exposure_s: float = 0.0) -> None:
+        """It waits no more: so many frames are planned (None: until there is enough), the longest
+        exposure of which takes `exposure_s`."""
+        self._planned, self._exposure_s, self._waits = planned, exposure_s, None
 
     def taken(self, tally: Tally) -> None:
         """The estimator has taken one more frame in."""
         self._moments.append((self._clock.now_ns(), tally.taken))
-        self._tell(at_once=tally.taken == self._folder.file.planned)
+        self._tell(at_once=tally.taken == self._planned)
 
     def replayed(self) -> None:
         """The estimator has taken in one more frame of before the interruption."""

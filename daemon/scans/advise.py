@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from daemon.scans.calibrate_dark import exposure_of
 from daemon.scans.measuring import MeasuringMethod
-from daemon.scans.method import Bench, Expose, Unsuitable
-from daemon.scans.pattern_scan import leakage_of, response_of
+from daemon.scans.method import Bench, Unsuitable
+from daemon.scans.parameters import exposure_of, leakage_of
+from daemon.scans.planned import exposures, source_references
 from daemon.separation.advice import Advice, Situation
-from daemon.separation.estimator import Lighting
 from daemon.separation.exposure import Settings
-from protocol.patterns import BLACK, WHITE, Checker
+from protocol.patterns import Checker
 from protocol.scans.measuring import Advise
 from protocol.scans.spec import Radiometry
 
@@ -25,7 +24,7 @@ class AdviseMethod(MeasuringMethod[Advise]):
 
     def __init__(self, spec: Advise, bench: Bench) -> None:
         super().__init__(spec, bench)
-        projector = self._projector()
+        projector = self.projector()
         self._sizes = tuple(sorted(set(spec.sizes)))
         if len(self._sizes) < 2 or 2 * self._sizes[-1] > min(projector.width, projector.height):
             raise Unsuitable(
@@ -35,20 +34,13 @@ class AdviseMethod(MeasuringMethod[Advise]):
             )
         patterns = [pattern for size in self._sizes for pattern in _sweep(size)]
         self._images = tuple(len(_sweep(size)) for size in self._sizes)
-        references = ((None, Lighting.AMBIENT), (BLACK, Lighting.BLACK), (WHITE, Lighting.WHITE))
-        self._plan = [
-            *(Expose(p, lighting, frames=4 * spec.average) for p, lighting in references),
-            *(
-                Expose(pattern, Lighting.PATTERN, index, spec.average)
-                for index, pattern in enumerate(patterns)
-            ),
-        ]
+        self._plan = [*source_references(4 * spec.average), *exposures(patterns, spec.average)]
 
     def estimator(self) -> Advice:
         """See `Method`."""
-        projector, camera = self._projector(), self.bench.camera
+        projector, camera = self.projector(), self.bench.camera
         return Advice(
-            response_of(Radiometry(), self.bench),
+            self.response,
             self._sizes,
             self._images,
             Situation(

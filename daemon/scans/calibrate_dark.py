@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from daemon.scans.measuring import MeasuringMethod
 from daemon.scans.method import Bench, Expose, Unsuitable
+from daemon.scans.parameters import exposure_of
 from daemon.separation.dark import Dark
 from daemon.separation.estimator import Lighting
 from protocol.scans.calibrations import CalibrateDark
@@ -38,14 +39,3 @@ class DarkMethod(MeasuringMethod[CalibrateDark]):
         """See `Method`."""
         pixel_format = self.bench.camera.pixel_format
         return Dark(pixel_format.full_scale, len(self._plan), pixel_format.bayer)
-
-
-def exposure_of(asked_us: float | None, bench: Bench) -> float:
-    """The run's exposure in µs: as asked for, else the camera's present one.
-
-    Raises Unsuitable for a camera that does not say.
-    """
-    found = asked_us if asked_us is not None else bench.exposure_us
-    if found is None:
-        raise Unsuitable("the camera does not say how long it exposes: --exposure", "$.exposure_us")
-    return found

@@ -6,15 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import ClassVar
 
-from daemon.scans.calibrate_dark import exposure_of
 from daemon.scans.measuring import MeasuringMethod
 from daemon.scans.method import Bench, Digest, Expose, Step
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import exposure_of
 from daemon.separation.estimator import Lighting
 from daemon.separation.latency import Latency
 from protocol.patterns import BLACK, WHITE
 from protocol.scans.calibrations import CalibrateLatency
-from protocol.scans.spec import Radiometry
 
 _GOLDEN = 0.6180339887
 
@@ -31,7 +29,7 @@ class LatencyMethod(MeasuringMethod[CalibrateLatency]):
 
     def __init__(self, spec: CalibrateLatency, bench: Bench) -> None:
         super().__init__(spec, bench)
-        self._projector()
+        self.projector()
         self._exposure_s = exposure_of(spec.exposure_us, bench) / 1e6
         self._longest_s = spec.longest_ms / 1e3
         self._coarse = spec.flashes // 2
@@ -70,4 +68,4 @@ class LatencyMethod(MeasuringMethod[CalibrateLatency]):
 
     def estimator(self) -> Latency:
         """See `Method`."""
-        return Latency(response_of(Radiometry(), self.bench), self.spec.longest_ms * 1e3)
+        return Latency(self.response, self.spec.longest_ms * 1e3)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import ClassVar
 
 from daemon.scans.measuring import MeasuringMethod
-from daemon.scans.method import Bench, Expose, Unsuitable
-from daemon.scans.pattern_scan import response_of
-from daemon.separation.estimator import Lighting
+from daemon.scans.method import Bench, Unsuitable
+from daemon.scans.planned import exposures, source_references
 from daemon.separation.leak import Leak
-from protocol.patterns import BLACK, WHITE, Checker
+from protocol.patterns import Checker
 from protocol.scans.calibrations import CalibrateLeak
-from protocol.scans.spec import Radiometry
 
 
 class LeakMethod(MeasuringMethod[CalibrateLeak]):
@@ -23,7 +21,7 @@ class LeakMethod(MeasuringMethod[CalibrateLeak]):
 
     def __init__(self, spec: CalibrateLeak, bench: Bench) -> None:
         super().__init__(spec, bench)
-        projector = self._projector()
+        projector = self.projector()
         self._sizes = tuple(sorted(set(spec.sizes), reverse=True))
         if len(self._sizes) < 2:
             raise Unsuitable("two sizes are needed, the larger is the reference", "$.sizes")
@@ -34,20 +32,13 @@ class LeakMethod(MeasuringMethod[CalibrateLeak]):
                 "$.sizes",
             )
         self._sets = [checkers(size) for size in self._sizes]
-        references = ((None, Lighting.AMBIENT), (BLACK, Lighting.BLACK), (WHITE, Lighting.WHITE))
         patterns = [pattern for one in self._sets for pattern in one]
-        self._plan = [
-            *(Expose(p, lighting, frames=4 * spec.average) for p, lighting in references),
-            *(
-                Expose(pattern, Lighting.PATTERN, index, spec.average)
-                for index, pattern in enumerate(patterns)
-            ),
-        ]
+        self._plan = [*source_references(4 * spec.average), *exposures(patterns, spec.average)]
 
     def estimator(self) -> Leak:
         """See `Method`."""
         images = tuple(len(one) for one in self._sets)
-        return Leak(response_of(Radiometry(), self.bench), self._sizes, images)
+        return Leak(self.response, self._sizes, images)
 
 
 def checkers(size: int) -> list[Checker]:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from daemon.scans.calibrate_dark import exposure_of
 from daemon.scans.measuring import MeasuringMethod
 from daemon.scans.method import Bench, Expose
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import exposure_of
 from daemon.separation.estimator import Lighting
 from daemon.separation.transfer import PhotonTransfer
 from protocol.patterns import WHITE
 from protocol.scans.calibrations import CalibrateNoise
-from protocol.scans.spec import Radiometry
 
 
 class NoiseMethod(MeasuringMethod[CalibrateNoise]):
@@ -35,4 +33,4 @@ class NoiseMethod(MeasuringMethod[CalibrateNoise]):
 
     def estimator(self) -> PhotonTransfer:
         """See `Method`."""
-        return PhotonTransfer(response_of(Radiometry(), self.bench))
+        return PhotonTransfer(self.response)

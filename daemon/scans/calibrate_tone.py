@@ -6,12 +6,11 @@ from typing import ClassVar
 
 from daemon.scans.measuring import MeasuringMethod
 from daemon.scans.method import Bench, Expose
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.planned import exposures
 from daemon.separation.estimator import Lighting
 from daemon.separation.tone_curve import ToneCurve
 from protocol.patterns import BLACK, WHITE, Solid
 from protocol.scans.calibrations import CalibrateTone
-from protocol.scans.spec import Radiometry
 
 
 class ToneMethod(MeasuringMethod[CalibrateTone]):
@@ -22,7 +21,7 @@ class ToneMethod(MeasuringMethod[CalibrateTone]):
 
     def __init__(self, spec: CalibrateTone, bench: Bench) -> None:
         super().__init__(spec, bench)
-        self._projector()
+        self.projector()
         steps = spec.levels - 1
         # As they are shown: rounded to the projector's 256 levels.
         inner = {round(255 * k / steps) / 255 for k in range(1, steps)}
@@ -30,12 +29,9 @@ class ToneMethod(MeasuringMethod[CalibrateTone]):
         self._plan = [
             Expose(WHITE, Lighting.WHITE, frames=2 * spec.average),
             Expose(BLACK, Lighting.BLACK, frames=2 * spec.average),
-            *(
-                Expose(Solid(level=level), Lighting.PATTERN, index, spec.average)
-                for index, level in enumerate(self._levels)
-            ),
+            *exposures((Solid(level=level) for level in self._levels), spec.average),
         ]
 
     def estimator(self) -> ToneCurve:
         """See `Method`."""
-        return ToneCurve(response_of(Radiometry(), self.bench), self._levels)
+        return ToneCurve(self.response, self._levels)

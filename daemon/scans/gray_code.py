@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 from daemon.scans.method import Bench, Unsuitable
@@ -21,20 +22,8 @@ class GrayCodeMethod(PatternMethod[GrayCode]):
     def __init__(self, spec: GrayCode, bench: Bench) -> None:
         if len(set(spec.axes)) < len(spec.axes):
             raise Unsuitable("each axis is to be named once", "$.axes")
-        self._images = [
-            Coded(axis, bit, inverted)
-            for axis in spec.axes
-            for bit in reversed(range(_bits(spec, bench, axis)))
-            for inverted in (False, True)
-        ]
-        super().__init__(
-            spec,
-            bench,
-            [
-                patterns.GrayCode(bit=i.bit, axis=patterns.Axis(i.axis), inverted=i.inverted)
-                for i in self._images
-            ],
-        )
+        self._images = code({axis: _bits(spec, bench, axis) for axis in spec.axes})
+        super().__init__(spec, bench, code_patterns(self._images))
 
     @property
     def even(self) -> bool:
@@ -55,6 +44,30 @@ class GrayCodeMethod(PatternMethod[GrayCode]):
         return GrayCodeDecoder(response, images=self._images, leakage=self.leakage, average=average)
 
 
+def code(bits: Mapping[patterns.Axis, int]) -> list[Coded]:
+    """The images of a code with so many bits an axis: from the coarsest bit to the finest, each
+    followed by its inverse."""
+    return [
+        Coded(axis, bit, inverted)
+        for axis, count in bits.items()
+        for bit in reversed(range(count))
+        for inverted in (False, True)
+    ]
+
+
+def code_patterns(images: Iterable[Coded]) -> list[patterns.GrayCode]:
+    """What the projector shows for them."""
+    return [
+        patterns.GrayCode(bit=image.bit, axis=patterns.Axis(image.axis), inverted=image.inverted)
+        for image in images
+    ]
+
+
+def bits_for(size: int) -> int:
+    """Bits that tell so many pixels apart."""
+    return max(1, (size - 1).bit_length())
+
+
 def _bits(spec: GrayCode, bench: Bench, axis: patterns.Axis) -> int:
     if spec.bits is not None:
         return spec.bits
@@ -63,5 +76,4 @@ def _bits(spec: GrayCode, bench: Bench, axis: patterns.Axis) -> int:
             "how many bits the code has is not known without a projector: say so (--bits)", "$.bits"
         )
     projector = bench.projector
-    size = projector.width if axis is patterns.Axis.X else projector.height
-    return max(1, (size - 1).bit_length())
+    return bits_for(projector.width if axis is patterns.Axis.X else projector.height)

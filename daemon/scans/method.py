@@ -23,6 +23,9 @@ from protocol.scans.spec import Spec
 
 S = TypeVar("S", bound=Spec)
 
+INCOMPLETE = "incomplete frame"
+"""The reason for which a frame that the camera delivered in part is not used."""
+
 
 class Unsuitable(Exception):
     """The rig cannot do the scan as it was asked for; says what and how to mend it."""
@@ -151,17 +154,19 @@ class Method(ABC, Generic[S]):
         """Decide what a frame is used for. Called once a frame, in order; recorded."""
 
     def foresee(self, frames: Iterator[NDArray[Any]]) -> None:
-        """See the frames of a recording, references included, before the first is observed or
-        recalled: as many as the method asks for. Each lasts until the next."""
+        """Look through a recording before its first frame is observed or recalled. `frames` gives
+        all of them from the first on, references included; each is valid until the next is taken.
+        """
         del frames
 
     def recall(self, pixels: NDArray[Any], observation: Observation) -> None:
-        """See a frame again that was observed before an interruption; in order."""
+        """See a frame again that `observe` has decided on before an interruption; in order."""
         del pixels, observation
 
     def decides_as(self, other: Method[Any]) -> bool:
-        """Whether `observe` decides on every frame as `other` did, a method of the same scan whose
-        frames are read in another way. If not, all frames are observed again."""
+        """Whether `observe` would decide on every frame as `other` did, a method of the same scan
+        with another reading of its frames (tone, black level ...). If not, reprocessing has every
+        frame observed again."""
         del other
         return True
 
@@ -174,6 +179,10 @@ class Method(ABC, Generic[S]):
         del summary, seconds
         return ""
 
+    def short(self) -> bool:
+        """Whether the video ended with too few frames for its reason to be one of the scene's."""
+        return False
+
     def conclude(self, components: Components) -> Components:
-        """The last word on the components before they are kept (masks that need the whole)."""
+        """Complete the components with what only the method knows, before they are kept."""
         return components

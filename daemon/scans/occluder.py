@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from numpy.typing import NDArray
 
 from daemon.scans.method import (
+    INCOMPLETE,
     Bench,
     Circle,
     Expose,
@@ -22,12 +23,10 @@ from daemon.scans.method import (
     Unsuitable,
     Watch,
 )
-from daemon.scans.pattern_scan import REFERENCES, response_of
+from daemon.scans.parameters import response_of
+from daemon.scans.planned import references
 from daemon.separation.estimator import Components, Lighting, Observation
-from daemon.separation.registration import (
-    Place,
-    Registration,
-)
+from daemon.separation.registration import Place, Registration
 from daemon.separation.strength import SourceStrength
 from daemon.separation.warping import aligned
 from protocol.scans.occluded import OccluderScan
@@ -36,28 +35,36 @@ from protocol.scans.spec import Reference
 O = TypeVar("O", bound=OccluderScan)  # noqa: E741
 
 MOST_CHANGE = 0.15
-"""Beyond this a change of the source is a cloud: below it, a scale."""
+"""A source that changed by a larger part is behind a cloud, and its frames are not used; after a
+smaller change they are scaled."""
 
 LEAST_CHANGE = 0.005
-"""Within this the source has not changed."""
+"""After a smaller change frames are used as they are."""
 
 LASTING = 50
-"""A source that is brighter than the reference for so many frames in a row is the reference."""
+"""After so many frames in a row that are brighter than the reference, these become the reference:
+the scan began under a cloud."""
 
 VAIN_TURNS = 5
-"""Turns of the circle that cover no more: then it never will."""
+"""After so many turns of the circle without more coverage the scan ends."""
+
+VAIN_FRAMES = 100
+"""Frames in use that those turns must have had: fewer say nothing of what the circle reaches,
+however often it went round while others were lost."""
 
 GROWTH = 0.0005
-"""Coverage grows by as much, or noise moves it."""
+"""A smaller rise of the coverage may be noise."""
 
 MANY_LOST = 0.1
-"""A part of the frames, lost, that is to be told with the coverage that they would have brought."""
+"""Where a larger part of the frames was lost, that is the reason given for missing coverage."""
+
+MOST_LOST = 0.5
+"""A part of the frames: with as many lost a scan that ends uncovered has failed."""
 
 MOST_WANDERED = 0.3
-"""Pixels by which the camera may have moved while its place was learned: beyond it a live
-collection begins anew."""
+"""Pixels that the camera may move while its place is learned; if it moved further, a live scan
+begins to collect anew."""
 
-INCOMPLETE = "incomplete frame"
 LOST = "lost frame"
 CLOUD = "cloud"
 SHAKEN = "moved too far, or too blurred, to be aligned"
@@ -105,7 +112,8 @@ class OccluderMethod(Method[O]):
         self._brighter = 0  # frames in a row
         self._strengths = (1.0, 1.0)  # of the source, the least and the most
         self._in_vain = _InVain()
-        self._references = tuple(Expose(*REFERENCES[reference]) for reference in wanted)
+        self._short = False  # the video ended uncovered, with most of its frames lost
+        self._references = tuple(references(wanted))
         self._watch = Watch(
             self._frames(), motion if self._live else None, self._lights() if self._live else ()
         )
@@ -294,33 +302,40 @@ class OccluderMethod(Method[O]):
         if not self._live or self._watch.motion is None:
             return ""
         covered = summary.get("coverage", 0.0)
-        wanted = f"{self.spec.coverage:.1%}"
+        reached = f"{covered:.1%} of the lit pixels are covered, {self.spec.coverage:.1%} wanted"
         if covered >= self.spec.coverage:
-            return f"{covered:.1%} of the lit pixels are covered, {wanted} wanted"
+            return reached
         if seconds >= self.spec.time_limit_s:
-            return (
-                f"the time limit of {self.spec.time_limit_s:g} s, at {covered:.1%} of "
-                f"{wanted} coverage"
-            )
-        turns = self._in_vain.turns(summary, seconds, self._watch.motion)
-        if turns >= VAIN_TURNS:
-            lost = self._rejected[LOST]
-            if lost > MANY_LOST * self._came:
-                return (
-                    f"{covered:.1%} of the lit pixels are covered, {wanted} wanted: {VAIN_TURNS} "
-                    f"turns covered no more, but {lost} of {self._came} frames were lost; scan "
-                    "again at a lower --frame-rate-hz"
-                )
-            return (
-                f"{covered:.1%} of the lit pixels are covered, {wanted} wanted: {VAIN_TURNS} turns "
-                "covered no more; what is left this circle does not reach, or it lies in shadows "
-                "or mirrors of the scene's own that are narrower than the mesh's pitch"
-            )
-        return ""
+            why = f"the time limit of {self.spec.time_limit_s:g} s"
+            return f"{why}: {reached}" + self._lost()
+        if self._in_vain.turns(summary, seconds, self._watch.motion) < VAIN_TURNS:
+            return ""
+        return f"{reached}: {VAIN_TURNS} turns covered no more" + (
+            self._lost()
+            or "; what is left this circle does not reach, or it lies in shadows or mirrors of the "
+            "scene's own that are narrower than the mesh's pitch"
+        )
+
+    def _lost(self) -> str:
+        """What to say of lost frames where a video ends uncovered; "": they are not why."""
+        lost = self._rejected[LOST]
+        self._short = lost > MOST_LOST * self._came
+        if lost <= MANY_LOST * self._came:
+            return ""
+        return (
+            f", but {lost} of {self._came} frames were lost: the camera's link, this computer or "
+            "its disk does not keep up; scan at a lower --frame-rate-hz or with a smaller picture, "
+            "and for longer (--time-limit-s)"
+        )
+
+    def short(self) -> bool:
+        """See `Method`."""
+        return self._short
 
 
 class _InVain:
-    """Counts turns of a circle that brought no coverage; frames that were not used don't count."""
+    """Counts the turns of a circle since coverage last grew; time in which no frame was used does
+    not count, nor do turns with hardly a frame."""
 
     def __init__(self) -> None:
         self._most = 0.0
@@ -339,7 +354,7 @@ class _InVain:
         if covered > self._most + GROWTH or frames < self._frames:
             self._most, self._frames = covered, frames
         passed, taken = seconds - self._began[0], every - self._began[1]
-        if passed <= 0.0 or taken <= 0.0:
+        if passed <= 0.0 or taken <= 0.0 or frames - self._frames < VAIN_FRAMES:
             return 0.0
         turn_s = math.tau * motion.radius_mm / motion.feed_mm_s
         return (frames - self._frames) * passed / taken / turn_s

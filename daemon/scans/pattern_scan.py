@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import ClassVar, TypeVar
@@ -13,84 +13,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon import patterns
-from daemon.scans.calibrate_dark import exposure_of
-from daemon.scans.method import Bench, Expose, Method, Step, Taken, Unsuitable
+from daemon.scans.method import INCOMPLETE, Bench, Expose, Step, Taken, Unsuitable
+from daemon.scans.parameters import exposure_of, leakage_of, noise_of, response_of
+from daemon.scans.planned import PlannedMethod, exposures, references
 from daemon.separation.bracket import Bracketed
 from daemon.separation.creep import Creep
 from daemon.separation.estimator import Estimator, Lighting, Observation
 from daemon.separation.exposure_noise import ROUNDING, Sensor
 from daemon.separation.extremes import Extremes
 from daemon.separation.frameset import FrameSet, Watched
-from daemon.separation.noise import Noise
-from daemon.separation.order_estimate import KEEP, LEAST, RANKS
+from daemon.separation.order_estimate import KEEP, LEAST, LEAST_FOR_BLUR
 from daemon.separation.radiometry import Response
-from protocol.patterns import BLACK, WHITE, AnyPattern
+from protocol.patterns import AnyPattern
 from protocol.scans.projected import PatternScan
-from protocol.scans.spec import Radiometry, Reference
+from protocol.scans.spec import Reference
 
 FINE_PX = 64
 """Patterns of larger checkers, patches or periods may light one end of a scene alone."""
 
+# Where `levels` looks at a pattern set: places of a square of projector pixels, with a margin for
+# blur; all places of a period where it is short, else so many at random.
 _PLACES, _MARGIN, _SAMPLES = 96, 8, 1500
 _REGION = 40
 
 P = TypeVar("P", bound=PatternScan)
 
-REFERENCES: dict[Reference, tuple[AnyPattern | None, Lighting]] = {
-    Reference.AMBIENT: (None, Lighting.AMBIENT),
-    Reference.BLACK: (BLACK, Lighting.BLACK),
-    Reference.WHITE: (WHITE, Lighting.WHITE),
-    Reference.OPEN: (None, Lighting.OPEN),
-}
-
-
-def response_of(radiometry: Radiometry, bench: Bench) -> Response:
-    """How this camera's counts follow from light: as asked for, else as calibrated, else as the
-    camera says. Raises Unsuitable for numbers that don't fit the camera."""
-    calibration = bench.calibration or {}
-    black = radiometry.black
-    if black is None:
-        black = float(calibration.get("black", bench.camera.black_level))
-    pixel_format = bench.camera.pixel_format
-    noise = _calibrated_noise(radiometry, bench)
-    try:
-        return Response(
-            full_scale=pixel_format.full_scale,
-            black=black,
-            tone=radiometry.tone,
-            saturation=radiometry.saturation,
-            bayer=pixel_format.bayer,
-            noise=None
-            if noise is None
-            else Noise.of_read_and_shot(*noise, black, pixel_format.full_scale),
-        )
-    except ValueError as error:
-        raise Unsuitable(str(error), "$.radiometry") from error
-
-
-def _calibrated_noise(radiometry: Radiometry, bench: Bench) -> tuple[float, float] | None:
-    """Read noise and counts an electron as calibrated; None where they are not, or where counts are
-    encoded, for they are of light."""
-    found = (bench.calibration or {}).get("noise")
-    if found is None or radiometry.tone != "linear":
-        return None
-    return float(found["read_counts"]), float(found["counts_per_e"])
-
-
-def leakage_of(radiometry: Radiometry, bench: Bench) -> float:
-    """b: as asked for, else as calibrated, else none."""
-    if radiometry.leakage is not None:
-        return radiometry.leakage
-    return float((bench.calibration or {}).get("leakage", 0.0))
-
 
 @lru_cache(maxsize=128)
 def _drawn(pattern: AnyPattern, side: int) -> NDArray[np.uint8]:
-    """A pattern as it is shown: for many blurs, and for the next scan."""
+    """A pattern as it is shown; cached, for it is needed at many blurs, and by the next scan."""
     return patterns.render(pattern, side, side)
 
 
-class PatternMethod(Method[P]):
+class PatternMethod(PlannedMethod[P]):
     """References first, then each pattern once, `average` frames each.
 
     `estimators` are those that a method has; the first is what auto chooses.
@@ -106,6 +61,7 @@ class PatternMethod(Method[P]):
     """
 
     estimators: ClassVar[tuple[str, ...]] = ("maxmin",)
+    _plan: Sequence[Expose]
 
     def __init__(self, spec: P, bench: Bench, pattern_set: Sequence[AnyPattern]) -> None:
         super().__init__(spec, bench)
@@ -117,7 +73,8 @@ class PatternMethod(Method[P]):
         self.response = response_of(spec.radiometry, bench)
         self.leakage = leakage_of(spec.radiometry, bench)
         self._own_us = 0.0  # the run's exposure; 0: not known
-        self._plan = self._bracketed([*self._references(), *self._exposures(pattern_set)])
+        shown = [*self._references(), *exposures(pattern_set, spec.average)]
+        self._plan = self._bracketed(shown)
         self._patterns = tuple(pattern_set)
         self._check()
 
@@ -126,17 +83,7 @@ class PatternMethod(Method[P]):
         recorded = self.bench.camera.recorded
         if wanted is None:
             wanted = () if recorded else (Reference.BLACK, Reference.WHITE)
-        frames = 1 if recorded else self.spec.average
-        return [
-            Expose(pattern, lighting, frames=frames)
-            for pattern, lighting in (REFERENCES[name] for name in wanted)
-        ]
-
-    def _exposures(self, pattern_set: Sequence[AnyPattern]) -> list[Expose]:
-        return [
-            Expose(pattern, Lighting.PATTERN, index, self.spec.average)
-            for index, pattern in enumerate(pattern_set)
-        ]
+        return references(wanted, frames=1 if recorded else self.spec.average)
 
     def _bracketed(self, plain: list[Expose]) -> tuple[Expose, ...]:
         """Each step at each exposure of the bracket. Raises Unsuitable for what cannot be had."""
@@ -172,11 +119,7 @@ class PatternMethod(Method[P]):
     def _check(self) -> None:
         camera = self.bench.camera
         if not camera.recorded:
-            if self.bench.projector is None:
-                raise Unsuitable(
-                    f"{self.name} needs a projector, and this rig has none: name one under "
-                    "[projector] in rig.toml"
-                )
+            self.projector()  # it needs one
             return
         planned = self.planned()
         if camera.frame_count is not None and camera.frame_count != planned:
@@ -238,17 +181,9 @@ class PatternMethod(Method[P]):
 
     @property
     def period(self) -> int:
-        """Of the pattern set, in projector pixels along both axes; more than any: it has none."""
+        """Of the pattern set, in projector pixels along both axes; of one without a period, a
+        length that is too large for `levels` to be one."""
         return _REGION + 1
-
-    def planned(self) -> int:
-        """Frames of the whole plan."""
-        return sum(step.frames for step in self._plan)
-
-    def step(self, index: int, summary: Mapping[str, float]) -> Step | None:
-        """See `Method`."""
-        del summary  # the plan is fixed
-        return self._plan[index] if index < len(self._plan) else None
 
     def observe(self, step: Step, taken: Taken) -> Observation:
         """See `Method`. An incomplete frame is not used; its pattern is averaged over the rest."""
@@ -263,7 +198,7 @@ class PatternMethod(Method[P]):
             pattern=step.index,
             last=last,
             used=not taken.incomplete,
-            reason="incomplete frame" if taken.incomplete else "",
+            reason=INCOMPLETE if taken.incomplete else "",
             exposure=step.exposure,
             exposure_us=taken.exposure_us if self._own_us else 0.0,
         )
@@ -272,7 +207,7 @@ class PatternMethod(Method[P]):
         """See `Method`. Exposures of a bracket are merged before the method's own estimator."""
         if self.spec.bracket is None:
             return self._watched(self.response, self.spec.average)
-        noise = _calibrated_noise(self.spec.radiometry, self.bench)
+        noise = noise_of(self.spec.radiometry, self.bench)
         return Bracketed(
             self.response,
             lambda response: self._watched(response, 1),
@@ -339,7 +274,7 @@ class RankedMethod(PatternMethod[P]):
                 "$.estimator",
             )
         ranked = not (few or name.startswith("maxmin"))
-        known = len(self._patterns) >= 2 * RANKS
+        known = len(self._patterns) >= LEAST_FOR_BLUR
         ordered = len(self._patterns) >= LEAST
         if name == "maxmin-unbiased" and not ordered:
             raise Unsuitable(

@@ -8,14 +8,15 @@ from collections.abc import Mapping
 from string import ascii_uppercase
 from typing import Any, TypeVar
 
+from daemon.scans.gray_code import bits_for, code, code_patterns
 from daemon.scans.measuring import MeasuringMethod
 from daemon.scans.method import Bench, Digest, Expose, Step, Unsuitable
-from daemon.scans.pattern_scan import leakage_of, response_of
-from daemon.separation.estimator import Lighting, Measurement
-from daemon.separation.graycode import Coded
+from daemon.scans.parameters import leakage_of
+from daemon.scans.planned import exposures, source_references
+from daemon.separation.estimator import Measurement
 from daemon.separation.verification import REACH, Anchors, Reading, Source, Spot
 from daemon.separation.verification import Verification as PointReadings
-from protocol.patterns import BLACK, WHITE, AnyPattern, Axis, GrayCode
+from protocol.patterns import AnyPattern, Axis
 from protocol.scans.spec import Radiometry
 from protocol.scans.verifications import Verification
 
@@ -28,23 +29,11 @@ class VerificationMethod(MeasuringMethod[V]):
 
     def __init__(self, spec: V, bench: Bench) -> None:
         super().__init__(spec, bench)
-        projector = self._projector()
+        projector = self.projector()
         self._spots = _spots(spec, bench)
-        self._images = [
-            Coded(axis, bit, inverted)
-            for axis, size in (("x", projector.width), ("y", projector.height))
-            for bit in reversed(range(max(1, (size - 1).bit_length())))
-            for inverted in (False, True)
-        ]
-        references = ((None, Lighting.AMBIENT), (BLACK, Lighting.BLACK), (WHITE, Lighting.WHITE))
-        self._plan = [
-            *(Expose(p, lighting, frames=2 * spec.average) for p, lighting in references),
-            *(
-                Expose(GrayCode(bit=i.bit, axis=Axis(i.axis), inverted=i.inverted), index=index)
-                for index, i in enumerate(self._images)
-            ),
-            Digest(),
-        ]
+        self._images = code({Axis.X: bits_for(projector.width), Axis.Y: bits_for(projector.height)})
+        shown = exposures(code_patterns(self._images), 1)
+        self._plan = [*source_references(2 * spec.average), *shown, Digest()]
 
     @abstractmethod
     def count(self) -> int:
@@ -62,7 +51,7 @@ class VerificationMethod(MeasuringMethod[V]):
 
     def planned(self) -> int:
         """Frames of the plan."""
-        return (super().planned() or 0) + self.count() * self.spec.average
+        return super().planned() + self.count() * self.spec.average
 
     def step(self, index: int, summary: Mapping[str, float]) -> Step | None:
         """See `Method`. Raises Unsuitable for a point that the projector's code does not reach."""
@@ -88,13 +77,13 @@ class VerificationMethod(MeasuringMethod[V]):
 
     def estimator(self) -> PointReadings:
         """See `Method`."""
-        projector = self._projector()
+        projector = self.projector()
         calibration = self.bench.calibration or {}
         leakage = self.spec.leakage
         if leakage is None and "leakage" in calibration:
             leakage = leakage_of(Radiometry(), self.bench)
         return PointReadings(
-            response_of(Radiometry(), self.bench),
+            self.response,
             self._spots,
             self._images,
             Source(

@@ -26,15 +26,14 @@ from daemon.separation.estimator import (
     Observation,
     Plot,
 )
-from daemon.separation.exposure import BRIGHTEST, Setting, Settings, filling
+from daemon.separation.exposure import BRIGHTEST, TARGET, Setting, Settings, filling
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.sampling import Mask, Moments
 
 _RESOLVED = 0.95  # of the largest size's contrast: a size that has it tells pixel from pixel
-_PEAK = 0.85  # of full scale: where the brightest part of the scene should be
 _CHECKER_SD = 1.9  # of a frame's noise: error of 25 shifts by their largest and smallest samples
 _SINUSOID = 12.0  # variance of global, in a frame's, times the number of phases
-_MOST_PHASES = 25
+_MOST_PHASES = 25  # of a sinusoid: beyond, frames are averaged instead
 _WEAVE = 1.0  # of the sinusoids that are advised: a scan's default
 
 
@@ -222,7 +221,7 @@ class Advice:
             factor, said = 0.5, f"{hot:.1%} of the pixels are saturated under white"
         else:
             peak = float(np.quantile(white, 1.0 - BRIGHTEST)) / full
-            factor, said = _PEAK / max(peak, 1e-3), f"white reaches {peak:.0%} of the scale"
+            factor, said = TARGET / max(peak, 1e-3), f"white reaches {peak:.0%} of the scale"
         return filling(self._situation.settings, factor), said
 
     def _scale(self, sign: Plane, mask: Mask) -> float:

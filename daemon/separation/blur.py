@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 _TOLD = 4
 """Contrast up to this size tells the blur: that of larger checkers is lost to local scattering."""
-_FINE = 9
+_FINE = 9  # points a pixel at which light is computed for `of_optics`
 _SIGMAS = np.arange(0.0, 3.0, 0.02)
 
 

@@ -37,9 +37,10 @@ from daemon.separation.estimator import (
     Observation,
     Result,
 )
-from daemon.separation.exposure_noise import ROUNDING, ExposureNoise, Mask, Sample, Sensor
+from daemon.separation.exposure_noise import ROUNDING, ExposureNoise, Sample, Sensor
 from daemon.separation.noise import Noise
 from daemon.separation.radiometry import FrameMean, Plane, Response
+from daemon.separation.sampling import Mask
 
 CROSSOVER = 0.01
 """q where no calibration tells it, of full scale: read and shot noise are alike there. A q that is

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon.separation.fineness import finer_pattern
 from daemon.separation.handedness import Wave, reversed_pattern
-
-Plane = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import Mask
 
 _PERIOD = 64.0
 """Projector pixels of the wave that a coordinate is made into; finer than this lies no mirror."""
@@ -27,7 +25,7 @@ _FAR = 24.0  # projector pixels
 _LAGS = (8, 32)  # pixels to farther ones
 _CLEAR = 2.0  # projector pixels
 _ACROSS = 3.0  # times the change along an axis: the other one's coordinate
-_ENOUGH = 400
+_ENOUGH = 400  # neighbours to compare
 
 
 @dataclass(frozen=True, slots=True)

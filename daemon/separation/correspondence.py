@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from math import ceil
 
 import numpy as np
-from numpy.typing import NDArray
 
-Plane = NDArray[np.float32]
+from daemon.separation.radiometry import Plane
 
 
 def unwrap(phases: Sequence[Plane], periods: Sequence[float], size: int) -> Plane:

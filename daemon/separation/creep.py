@@ -21,8 +21,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.deviation import NOISE
 from daemon.separation.estimator import Components, Lighting, Observation, Quality
-from daemon.separation.finish import DEVIATIONS, SIGNIFICANT, bits, count
+from daemon.separation.finish import SIGNIFICANT, bits, count
 from daemon.separation.radiometry import Plane, Response
 
 Double = NDArray[np.float64]
@@ -283,7 +284,7 @@ def marked(components: Components, crept: Crept | None) -> tuple[Components, lis
         quality = quality | bits(off, Quality.MOVED)
         facts["quality"] = count(quality)
         planes = {
-            name: np.hypot(plane, apart * np.float32(0.5)) if name in DEVIATIONS else plane
+            name: np.hypot(plane, apart * np.float32(0.5)) if name in NOISE else plane
             for name, plane in planes.items()
         }
         lines.append(

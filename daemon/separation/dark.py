@@ -9,12 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import Curve, Measurement, NotYet, Observation, Plot
-from daemon.separation.sampling import Moments, Plane, Turns, line
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import Moments, Turns, line
 
 _HOT = 8.0
 """A hot pixel is above its neighbours by so many standard deviations of its mean, and ..."""
 _HOT_COUNTS = 2.0
 """... by so many counts."""
+_APART = 1.01
+"""Exposures whose quotient is less are one exposure: a line through them says nothing."""
+
 _SEEN = 2.0
 """Light has reached the sensor where the picture varies so many times more than its noise."""
 
@@ -59,10 +63,17 @@ class Dark:
         self._open = Moments()
 
     def result(self) -> Measurement:
-        """See `Estimator`. Raises NotYet before the last exposure is in."""
+        """See `Estimator`. Raises NotYet before the last exposure is in, and for a camera that does
+        not expose as it is told."""
         if len(self._points) < self._exposures or self._longest is None:
             raise NotYet(f"{len(self._points)} of {self._exposures} exposures have been taken")
         exposure, level, variance = (np.asarray(c) for c in zip(*self._points, strict=True))
+        if exposure.max() <= _APART * exposure.min():
+            raise NotYet(
+                f"the camera says that it exposed for {exposure.max() / 1e3:.3g} ms each time, "
+                "whatever it was told: switch its automatic exposure off, or set the exposure that "
+                "scans use on the camera and do without this calibration"
+            )
         (black, rate), (black_sd, _) = line(exposure, level)
         (floor, growth), _ = line(exposure, variance)
         read = max(floor, 0.0) ** 0.5

@@ -8,6 +8,9 @@ from math import ceil, floor, log10
 
 LONGEST_US = 1e6
 """Beyond a second light and scene are seldom still enough: no longer one is chosen unasked."""
+TARGET = 0.8
+"""Where a picture's level is to be, as a share of full scale: there is room for a source that grows
+a little brighter."""
 BRIGHTEST = 0.001
 """Share of a picture's samples that may be brighter than its level, and so may saturate."""
 

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from daemon.separation.noise import from_frame
 from daemon.separation.radiometry import Plane, Response
-
-Mask = NDArray[np.bool_]
+from daemon.separation.sampling import Mask
 
 ROUNDING = 1.0 / 12.0
 """Variance of a count's rounding error."""
 
 _SAMPLES = 30_000  # compared of a pattern, on an odd grid: all colours of a mosaic
-_LEVELS = 24
+_LEVELS = 24  # of light, with a deviation each
 _ENOUGH = 50  # samples of a level
 _OUTLIER = 4.0  # deviations
 

@@ -16,17 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import light_model
+from daemon.separation.deviation import stated
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import WaveSums
 from daemon.separation.order import Ranked
-from daemon.separation.order_estimate import Estimated, OrderStatistics
+from daemon.separation.order_estimate import LEAST_FOR_BLUR, Estimated, OrderStatistics
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import NOT_SHIFTS, Mirrors, in_order, misfit_of, of_shifts
 from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import HALF, compare
-from daemon.separation.uneven import unevenness
+from daemon.separation.uneven import Uneven, unevenness
+
+NOT_LIT_OR_UNLIT = (
+    "nearly every pixel has many samples between its darkest and its brightest: the frames are no "
+    "patterns of lit and unlit patches (sinusoids are a method of their own, -m sinusoid), or the "
+    "patches are so blurred that hardly a pixel is in one (--patch)"
+)
+_FEW = (
+    "{} patterns do not tell how much the projector blurs: beside edges of the patterns direct is "
+    "too small by more than the stated deviation; {} patterns tell (--patterns, --shifts)"
+)
 
 
 class Extremes:
@@ -167,26 +178,24 @@ class Extremes:
         direct, indirect = light_model.from_extremes(lit, unlit, self._alpha, b)
         planes: dict[str, NDArray[Any]] = {}
         judgement = Judgement.of_extremes(deviation, patterns)
-        stated: dict[str, Any] = {}
+        facts: dict[str, Any] = {}
         if found is not None:
             direct_var, global_var = self._variances(found, told)
             if unbiased:
                 source = self._better(told, direct, indirect, direct_var, global_var) or source
-            planes = {"direct_std": np.sqrt(direct_var), "global_std": np.sqrt(global_var)}
-            stated = {"blur_px": found.blur, **found.systematic(b, g, biased=not unbiased)}
+            noises = np.sqrt(direct_var), np.sqrt(global_var)
+            facts = {"blur_px": found.blur, **found.systematic(b, g, biased=not unbiased)}
             if unbiased:
                 rounding = self._response.deviation(None, self._response.counts(high[0]))
                 direct_limit, total_limit = (
-                    np.float32(SIGNIFICANT) * np.maximum(plane, rounding)
-                    for plane in planes.values()
+                    np.float32(SIGNIFICANT) * np.maximum(plane, rounding) for plane in noises
                 )
                 own = deviation * np.float32(1.0 / found.uneven)
                 judgement = Judgement(direct_limit, total_limit, own)
-            if len(low) > 1:
-                own = found.deviation * np.float32(1.0 / found.uneven)
-                uneven = unevenness(low, high, own, planes, patterns, shifted=self._shifted)
-                planes, advice = uneven.planes, advice + uneven.advice
-                flags = uneven.flags if flags is None else flags | uneven.flags
+            uneven = self._uneven(low, high, found, noises)
+            planes = stated(*noises, found.off(b, None if unbiased else direct), uneven.off)
+            advice += uneven.advice
+            flags = uneven.flags if flags is None else flags | uneven.flags
         saturated = self._saturated
         if saturated is None:
             saturated = self._high.planes[0] >= self._response.saturated_from
@@ -211,16 +220,42 @@ class Extremes:
                 "lit_fraction": self._alpha,
                 "leakage": b,
                 **told.facts(),
-                **stated,
+                **facts,
                 **mirrors.facts,
                 **steady,
-                "advice": ([] if mirrors.as_declared else [NOT_SHIFTS]) + advice + told.advice(),
+                "advice": [
+                    *self._declared(mirrors, told),
+                    *([_FEW.format(patterns, LEAST_FOR_BLUR)] if patterns < LEAST_FOR_BLUR else []),
+                    *advice,
+                    *told.advice(),
+                ],
                 **self._references.facts(source),
             },
         )
 
+    def _declared(self, mirrors: Mirrors, told: Told) -> list[str]:
+        """A line where the frames are not the patterns that were declared."""
+        if not mirrors.as_declared:
+            return [NOT_SHIFTS]
+        if self._shifted or self._order is None or self._order.of_two_levels(told):
+            return []
+        return [NOT_LIT_OR_UNLIT]
+
     def _light(self, samples: NDArray[Any]) -> Plane:
         return self._response.linear(samples) if self._mean is None else samples
+
+    def _uneven(
+        self, low: Plane, high: Plane, found: Estimated, noises: tuple[Plane, Plane]
+    ) -> Uneven:
+        if len(low) == 1:
+            return Uneven.unknown(low[0])
+        # Noise is measured where light is bright. Where it is not, a count says nothing: files of
+        # 8 bits are often of fewer.
+        count = self._response.slope(self._response.counts(high[0]))
+        noise = np.maximum(found.deviation * np.float32(1.0 / found.uneven), count)
+        return unevenness(
+            low, high, noise, np.maximum(*noises), self._low.frames, shifted=self._shifted
+        )
 
     def _variances(self, found: Estimated, told: Told) -> tuple[Plane, Plane]:
         """Of direct and of global light: of noise, that of the references included."""

@@ -14,19 +14,16 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon.separation.handedness import Wave
-from daemon.separation.sampling import thinned
-
-Plane = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import Mask, thinned
 
 FINER = 2.2
 """How many times the picture's own rate of change, each way, is a mirror's."""
 
 _RESOLVED = 0.45  # typical change from pixel to pixel from which a finer pattern is not told apart
-_PERIODS = 2.0
+_PERIODS = 2.0  # changes of the pattern across a window
 _LEAST, _MOST = 9, 65  # pixels of a window
 _FADE = np.float32(2.5)  # deviations of noise below which a sign fades
 _AROUND = 5  # pixels over which a pattern must be strong

@@ -1,13 +1,14 @@
 """All samples of a few pixels, and the noise that is left in them when the light is taken out.
 
-Light under patterns has few parts, and noise has no order, so that what few parts leave over is
-noise, whatever blur, texture and place in the pattern made of the light:
+The light of a pixel, or of a few neighbours, over all patterns is a matrix of low rank; noise is
+not. So what the few largest components of the matrix leave over is noise, whatever blur, texture
+and place in the pattern made of the light:
 
 - A checkerboard is a stripe along x times a stripe along y, under any blur. Over a grid of shifts
   a pixel's light is a constant and one such product: a matrix of rank 1 beside its rows' means.
-- Under patterns without order a few neighbours share the patches that they see: their light over
-  the patterns is a matrix of low rank, found by its singular values. Those of noise alone lie as
-  Marchenko and Pastur have it (Veraart et al., NeuroImage 142, 2016).
+- Under patterns without order a few neighbours share the patches that they see, and their light
+  over the patterns has a low rank. It is found by the eigenvalues: those of noise alone are spread
+  as Marchenko and Pastur have it (Veraart et al., NeuroImage 142, 2016).
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ _LEAST = 32  # of them, to say anything
 _DIM = 0.2  # of the brightest pixels' step: with less, a pixel is not looked at
 _SURPLUS = 3.5  # times the variance expected from which a matrix, or a frame, holds more than noise
 _FLOOR = 0.03  # of a matrix's mean variance, the least that a sample of it has
-_ROUNDS = 4
-_LEVELS = 65
+_ROUNDS = 4  # of fitting, each without the matrices that the last found too noisy
+_LEVELS = 65  # that the noise is given at
 
 
 class Followed:
@@ -114,9 +115,13 @@ def _places(shape: tuple[int, ...], run: int, mosaic: bool) -> NDArray[np.intp]:
 
 
 def _noise(matrices: Double, response: Response, average: int, rank: int | None) -> Noise | None:
-    """From what `rank` parts (None: as many as there are) and the rows' means leave of matrices of
-    light (n, rows, columns), its variance being linear in light, as of a sensor, and in the square
-    of the slope of the tone curve, as of what comes after it. None: it is not noise alone."""
+    """The noise in what is left of matrices of light (n, rows, columns) without the means of their
+    rows and `rank` components (None: those that are told from noise).
+
+    Its variance is fitted as a constant, a part proportional to light (a sensor's) and, behind a
+    tone curve, one proportional to the square of the curve's slope (of what comes after it).
+    None: it is not noise alone.
+    """
     columns = matrices.shape[2]
     light = matrices - matrices.mean(axis=2, keepdims=True)
     values, vectors = np.linalg.eigh(light @ light.transpose(0, 2, 1))
@@ -155,8 +160,8 @@ def _smallest(values: Double, rank: int) -> NDArray[np.bool_]:
 
 
 def _of_noise(values: Double, columns: int) -> NDArray[np.bool_]:
-    """Which of ascending eigenvalues (n, rows) noise makes: the most whose range is not more than
-    Marchenko and Pastur's 4 σ² √(m/N) of their mean σ²."""
+    """Which of ascending eigenvalues (n, rows) are noise: as many of the smallest as have a range
+    within Marchenko and Pastur's 4 σ² √(m/N), σ² their mean."""
     values, rows = np.maximum(values, 0.0), values.shape[1]
     m = np.arange(1, rows + 1)
     free = columns - 1 - (rows - m)  # columns beside the means and the parts

@@ -10,7 +10,9 @@ which an extreme or a fit makes light in any case.
 from __future__ import annotations
 
 import zlib
-from dataclasses import replace
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -22,17 +24,18 @@ from daemon.separation.estimator import Components, Estimator, Lighting, Observa
 from daemon.separation.mosaic import orders_of
 from daemon.separation.radiometry import Plane, Response
 
-_SAMPLES = 20_000
+_SAMPLES = 20_000  # of a frame
 _ODD = 0.2  # of the usual light: a frame of few so far from it is none of the set
 _ODD_PAIR = 0.08  # of two, whose usual light is in the middle
 _ODD_AT_LEAST = 0.05  # where many frames say how much it differs from pattern to pattern ...
 _ODD_SPREADS = 8.0  # ... by so many deviations
 _MANY = 6  # frames
 _STEP = 0.04  # of the light: less is a lamp's own unrest
-_STEP_ERRORS = 5.0
+_STEP_ERRORS = 5.0  # standard errors of a step
 _UNEQUAL = 0.05  # of a pair's light, from pair to pair
 _SAME = 0.35  # of the usual difference of two frames in a row: below it they are one pattern
-_MOST_NAMED = 5
+_MOST_NAMED = 5  # frames in a line of advice
+_PRINTS = 4096  # frames whose bits are remembered: of longer scans, the last
 _BRIGHT = {Lighting.WHITE, Lighting.PATTERN}
 _LOOK = 1024  # pixels a side that are looked at for a mosaic
 _DEPTHS = (10, 12, 14)  # bits that files of 16 hold
@@ -91,18 +94,35 @@ def _depth(largest: int, *, ends: bool = True) -> str:
     return f"--depth {bits}" if bits < 16 and (not ends or largest == (1 << bits) - 1) else ""
 
 
+@dataclass(slots=True)
+class _Mean:
+    """Of numbers that are not kept."""
+
+    total: float = 0.0
+    count: int = 0
+
+    def add(self, value: float) -> None:
+        self.total += value
+        self.count += 1
+
+    @property
+    def value(self) -> float:
+        return self.total / self.count
+
+
 class FrameSet:
-    """Facts of frames as they come; memory: one sample of a frame, and a few numbers a pattern."""
+    """Facts of frames as they come; memory: one sample of a frame, a few numbers a pattern, and
+    one for each of the last `_PRINTS` frames."""
 
     def __init__(self, response: Response, *, even: bool, distinct: bool = True) -> None:
         """`even`: the patterns are fine, and of one lit fraction; `distinct`: no two are alike."""
         self._response = response
         self._even = even
         self._distinct = distinct
-        self._levels: dict[int, list[float]] = {}
-        self._references: dict[Lighting, list[float]] = {}
+        self._levels: defaultdict[int, _Mean] = defaultdict(_Mean)  # of a pattern's frames
+        self._references: defaultdict[Lighting, _Mean] = defaultdict(_Mean)
         self._prints: dict[int, int] = {}  # of a frame's bits: its pattern; -1: a reference
-        self._copies: list[tuple[int, int]] = []
+        self._copies: dict[tuple[int, int], None] = {}  # in the order in which they came
         self._last: tuple[int, Plane] | None = None
         self._steps: dict[tuple[int, int], float] = {}  # differences of frames in a row
         self._ceiling = Ceiling()
@@ -120,12 +140,12 @@ class FrameSet:
         light = self._response.linear(sample)
         level = float(light.mean(dtype=np.float64))
         if observation.lighting is not Lighting.PATTERN:
-            self._references.setdefault(observation.lighting, []).append(level)
+            self._references[observation.lighting].add(level)
             self._printed(sample, -1)
             return
         pattern = observation.pattern
         self._printed(sample, pattern)
-        self._levels.setdefault(pattern, []).append(level)
+        self._levels[pattern].add(level)
         if self._last is not None and self._last[0] != pattern:
             apart = float(np.mean(np.abs(light - self._last[1]), dtype=np.float64))
             self._steps[self._last[0], pattern] = apart
@@ -137,7 +157,9 @@ class FrameSet:
         mark = zlib.crc32(sample.tobytes()) << 32 | zlib.adler32(sample.tobytes())
         first = self._prints.setdefault(mark, pattern)
         if first != pattern:
-            self._copies.append((first, pattern))
+            self._copies[first, pattern] = None
+        if len(self._prints) > _PRINTS:
+            del self._prints[next(iter(self._prints))]
 
     def told(self) -> tuple[dict[str, Any], list[str], list[str]]:
         """Facts, lines of advice, and what is to be said after all other advice."""
@@ -154,7 +176,7 @@ class FrameSet:
         facts: dict[str, Any] = {"compressed": bool(self._compressed)}
         if self._even and len(self._levels) >= 2:
             order = sorted(self._levels)
-            levels = np.array([float(np.mean(self._levels[n])) for n in order])
+            levels = np.array([self._levels[n].value for n in order])
             usual = float(np.median(levels))
             if usual > 0:
                 off = levels / usual - 1.0
@@ -169,7 +191,7 @@ class FrameSet:
         if not self._distinct:
             return []
         lines = []
-        for first, second in self._copies[:_MOST_NAMED]:
+        for first, second in islice(self._copies, _MOST_NAMED):
             what = "a reference frame" if first < 0 else f"pattern {first + 1}'s frame"
             lines.append(
                 f"pattern {second + 1}'s frame is {what} over again, bit by bit: see that each "
@@ -177,12 +199,11 @@ class FrameSet:
                 if second >= 0
                 else f"a reference frame is {what} over again, bit by bit: name the right files"
             )
-        copied = set(self._copies)
         usual = float(np.median(list(self._steps.values()))) if len(self._steps) > 3 else 0.0
         again = [
             pair
             for pair, apart in self._steps.items()
-            if apart < _SAME * usual and pair not in copied
+            if apart < _SAME * usual and pair not in self._copies
         ]
         lines += [
             f"the frames of patterns {first + 1} and {second + 1} hardly differ: one pattern was "
@@ -193,21 +214,20 @@ class FrameSet:
 
     def _swapped(self) -> list[str]:
         black, white = (self._references.get(kind) for kind in (Lighting.BLACK, Lighting.WHITE))
-        if black and white and np.mean(black) >= np.mean(white):
+        if black and white and black.value >= white.value:
             return [
                 "the black frame is brighter than the white one: are the two exchanged "
                 "(--black-frame, --white-frame)?"
             ]
-        levels = [level for some in self._levels.values() for level in some]
-        if not levels or not self._even:
+        if not self._levels or not self._even:
             return []
-        typical = float(np.median(levels))
-        if white and typical > float(np.mean(white)):
+        typical = float(np.median([level.value for level in self._levels.values()]))
+        if white and typical > white.value:
             return [
                 "the patterns' frames are brighter than the white frame: it is of another "
                 "exposure or scene, and what follows from it is wrong"
             ]
-        if black and typical < float(np.mean(black)):
+        if black and typical < black.value:
             return [
                 "the patterns' frames are darker than the black frame: it is of another "
                 "exposure or scene, and what follows from it is wrong"

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.coordinates import mirrored_coordinates
+from daemon.separation.deviation import stated
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.frameset import PairSums
@@ -148,19 +149,17 @@ class GrayCodeDecoder:
         step = contrast * np.float32(0.5)
         pair_var = np.square(told.deviation(half + step))
         pair_var += np.square(told.deviation(half - step))
-        count, spread = (
-            plane if pair_var.ndim == 2 else plane[..., None] for plane in (fine.count, fine.spread)
+        scatter, spread = (
+            plane if pair_var.ndim == 2 else plane[..., None]
+            for plane in (fine.scatter, fine.spread)
         )
-        noise_std: Plane = np.sqrt(pair_var / count) * np.float32(1.0 / (1.0 - b))
-        direct_std: Plane = np.hypot(noise_std, spread * np.float32(1.0 / (1.0 - b)))
+        by = np.float32(1.0 / (1.0 - b))
+        direct_std: Plane = np.sqrt(pair_var) * scatter * by
         global_var = total.of_references(told.deviation) * np.float32(self._average)
         global_var += pair_var * np.asarray(total.of_half * (0.25 / self._pairs), np.float32)
-        global_std: Plane = np.sqrt(direct_std**2 + global_var)
-        planes: dict[str, NDArray[Any]] = {
-            "direct_std": direct_std,
-            "global_std": global_std,
-            "stripe": stripe,
-        }
+        global_std: Plane = np.sqrt(np.square(direct_std) + global_var)
+        off: Plane = np.broadcast_to(spread * by, direct.shape)
+        planes = {**stated(direct_std, global_std, off), "stripe": stripe}
         coordinates = self.coordinates(np.float32(SIGNIFICANT) * _grey(deviation))
         planes.update(coordinates)
         mirrors = mirrored_coordinates(
@@ -180,7 +179,7 @@ class GrayCodeDecoder:
             brightest=self._brightest,
             saturated=self._saturated,
             judgement=Judgement(
-                direct=np.float32(SIGNIFICANT) * noise_std,
+                direct=np.float32(SIGNIFICANT) * direct_std,
                 total=np.float32(SIGNIFICANT) * global_std,
                 deviation=deviation,
             ),

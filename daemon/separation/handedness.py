@@ -18,10 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.sampling import thinned
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import Mask, thinned
 
-Plane = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Wave = NDArray[np.complex64]
 
 STRONG = 6.0
@@ -29,7 +28,7 @@ STRONG = 6.0
 
 _WINDOW = 5  # pixels over which a phase's slope is taken
 _COHERENT = 0.3  # of the slopes in a window: below, a border runs through it
-_LEAST_MAJORITY = 0.6
+_LEAST_MAJORITY = 0.6  # of the usable pixels must agree on a way round
 _REACH = 41  # pixels, about a find
 
 

@@ -22,8 +22,8 @@ _PARTLY = 0.03
 """A frame tells the moment of the change if it saw at least this part of both sides."""
 _SAFE = 3.0
 """Deviations that the wait which is applied has beyond the mean."""
-_LEAST = 5
-_RESOLUTION_US = 100.0
+_LEAST = 5  # frames that saw the change, to tell its spread
+_RESOLUTION_US = 100.0  # a shorter latency is none
 
 
 class Latency:

@@ -24,7 +24,7 @@ _RESOLVED = 0.5
 """A size whose contrast is less than this part of the largest's is not resolved."""
 _DIRECT = 0.25
 """Of the light, at least this part must be direct where contrast is measured."""
-_SURE = 0.05
+_SURE = 0.05  # standard deviation of a size's leakage, at most, to call it measured
 _USUAL = 4  # px: scans show no smaller patches, and that these blur is no news
 
 

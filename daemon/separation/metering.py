@@ -16,14 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.exposure import BRIGHTEST, Limits
+from daemon.separation.exposure import BRIGHTEST, TARGET, Limits
 from daemon.separation.radiometry import Response
 
-TARGET = 0.8
-"""Where auto-exposure puts the level, as a share of full scale."""
-
-_TOLERANCE = 0.05
-_LOOKS = 10
+_TOLERANCE = 0.05  # part of the target by which the level may be off
+_LOOKS = 10  # pictures, at most
 _CUT = 4.0  # a saturated picture does not say by how much: try a quarter
 _GROW = 16.0  # a dark one is mostly noise: believe it no further
 

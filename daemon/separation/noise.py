@@ -7,6 +7,7 @@ an upper bound (`from_picture`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,14 +23,14 @@ _ROUNDING = 12.0**-0.5  # deviation of a count's rounding error
 _CLIPPED = 4.0  # deviations above 0 counts from which noise is whole
 _CURVE = 65  # levels that a calibrated curve is given at
 
-_LEVELS = 32
+_LEVELS = 32  # of counts, with a table of differences each
 _PER_OCTAVE = 8  # bins of a difference: 1/8 octave
 _BINS = 17 * _PER_OCTAVE
 _ENOUGH = 200  # differences that make a level's deviation
 
 _SECOND_DIFFERENCE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
 _SECOND_DIFFERENCE_NORM = 6.0  # what it makes of independent samples of deviation 1
-_BLOCK = 16
+_BLOCK = 16  # pixels a side
 _QUIET = 0.91  # of pure noise, what the quietest fifth of such blocks has
 _BLOCKS = 12  # blocks that make a level's deviation
 _CUT = 0.05  # of a block's samples at an end of the scale: its median difference has less noise
@@ -64,6 +65,16 @@ class Noise:
         ratio = np.asarray(self.deviations) / expected
         whole = levels > _CLIPPED * expected
         return float(np.median(ratio[whole] if whole.any() else ratio))
+
+    @classmethod
+    def mean(cls, found: Sequence[Noise]) -> Noise:
+        """The mean of some, in whatever order, at each level of those that know it."""
+        levels = np.unique(np.concatenate([one.levels for one in found]))
+        curves = [
+            np.interp(levels, one.levels, one.deviations, left=np.nan, right=np.nan)
+            for one in found
+        ]
+        return cls(tuple(levels.tolist()), tuple(np.nanmean(curves, axis=0).tolist()))
 
     def bounded_by(self, other: Noise) -> Noise:
         """The lower of two upper bounds where both are known, else the one that is."""

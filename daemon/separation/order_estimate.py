@@ -1,8 +1,8 @@
 """Lit and unlit light from the most extreme of a pixel's samples, without what noise and blur do.
 
-Of some pixels all samples are kept (`followed`): they tell the noise, and with it known how far
-apart their ranks lie tells the blur. What these two do to the most extreme samples under the very
-pattern set is simulated (`order_model`), and is taken off at each pixel.
+Of some pixels all samples are kept (`followed`). They tell the noise; and once that is known, the
+distances between their ranked samples tell the blur. What noise and blur do to the most extreme
+samples is simulated for the pattern set at hand (`order_model`), and taken off at each pixel.
 """
 
 from __future__ import annotations
@@ -19,21 +19,26 @@ from daemon.separation.followed import Followed
 from daemon.separation.noise import Noise
 from daemon.separation.order_model import RATIOS, OrderErrors, OrderModels
 from daemon.separation.radiometry import Plane, Response
+from daemon.separation.sampling import thinned
 from daemon.separation.scan_noise import ScanNoise, Told
 
 KEEP = 5
 """Samples kept at each end; a checkerboard's 25 shifts light every pixel wholly in 9 or more."""
 
-RANKS = 3
-"""Samples to keep at each end at least: fewer do not tell blur."""
+_RANKS = 3  # samples at each end at least: fewer do not tell blur
+
+LEAST_FOR_BLUR = 2 * _RANKS
+"""Patterns that tell blur."""
 
 LEAST = 4
 """Patterns of which something is known of order: with fewer, there is one sample at an end."""
 
-_SOME = 8192  # pixels that a typical one is found among
-_GROUPS = 8
+_PLACE = ("lit_place", "unlit_place", "shared_place")
+_GROUPS = 8  # of pixels, by their light
 _LEAST = 32  # pixels that make a group
 _DIM = 0.2  # of the brightest pixels' step: with less, a pixel is not looked at
+_TOLD = 10.0  # deviations of noise, of a step whose samples are looked at
+_BETWEEN = 0.16  # of a place's samples: a wave has a third of them in the middle half of its step
 _WITHIN = 1.5  # times the distance of the kept ranks from an end of the scale, to be clear of it
 _FINE = 640  # ratios of noise and step that are told apart, evenly in their logarithm
 _FIRST = 1.6  # deviations that the first of a dozen samples is off
@@ -80,6 +85,19 @@ class OrderStatistics:
         """What is known of the noise by now; `ordered`: patterns came in their order, if any."""
         return noise.told(self._residual or self._noise(), ordered=ordered)
 
+    def of_two_levels(self, told: Told) -> bool:
+        """Whether the samples followed can be lit and unlit ones: under patterns of many levels
+        samples of nearly every place lie between its darkest and its brightest."""
+        light = self._followed.light()
+        low, high = light.min(axis=0), light.max(axis=0)
+        step = high - low
+        seen = step > np.maximum(_DIM * np.quantile(step, 0.9), _TOLD * told.deviation(high))
+        if np.count_nonzero(seen) < _LEAST:
+            return True
+        quarter = np.float32(0.25) * step
+        between = np.mean((light > low + quarter) & (light < high - quarter), axis=0)
+        return float(np.quantile(between[seen], 0.1)) < _BETWEEN
+
     def estimate(self, low: Plane, high: Plane, told: Told) -> Estimated:
         """Lit and unlit light of each pixel, from the light (keep, ...) of its darkest and its
         brightest samples, the most extreme first; with `keep` 1 of these, else of the best k."""
@@ -100,11 +118,12 @@ class OrderStatistics:
         return _estimated(blur, model, uneven, (low, high), (dark, lit))
 
     def _explained(self, told: Told) -> tuple[float | None, OrderErrors, float]:
-        """The blur (None: not known) that explains, with the noise, how far apart the ranks of the
-        samples followed are; what both do; and how many times their noise samples differ by."""
+        """What explains the distances between the ranks of the samples that are followed: the blur
+        (None: not known), the errors that it makes together with the noise, and by how many times
+        their noise samples differ."""
         light = self._followed.light()
         groups = None
-        if len(light) >= 2 * RANKS:
+        if len(light) >= LEAST_FOR_BLUR:
             groups = _grouped(np.sort(light, axis=0), self._keep, self._response)
         if groups is None:
             return None, self._models.at(0.0)[1], 1.0
@@ -189,17 +208,35 @@ class Estimated:
         indirect *= np.float32(((1.0 - b) * g * self.uneven) ** -2)
         return np.maximum(direct, 0, out=direct), np.maximum(indirect, 0, out=indirect)
 
+    def off(self, b: float, biased: Plane | None) -> Plane:
+        """How far components may be off, as a deviation, by where a pixel lies in the pattern (that
+        of a pixel like most, as a part of its step: what direct light lacks global light has), and
+        by what noise and blur left in direct light if it is `biased`."""
+        step: Plane = np.maximum(self.lit - self.unlit, np.float32(0.0))
+        ratio, k = self._typical(step)
+        lit, unlit, shared = self._of(_PLACE, ratio, k)
+        off: Plane = step * np.float32(max(lit + unlit - 2.0 * shared, 0.0) ** 0.5 / (1.0 - b))
+        if biased is not None:
+            np.hypot(off, biased - (self.lit - self.unlit) * np.float32(1.0 / (1.0 - b)), out=off)
+        return off
+
+    def _typical(self, step: Plane) -> tuple[float, int]:
+        """Noise over the step of a pixel like most, and the number of its samples averaged."""
+        ratios = thinned(self.deviation) / np.maximum(thinned(step), _TINY)
+        ratio = float(np.clip(np.median(ratios), RATIOS[0], RATIOS[-1]))
+        k = self.k or int(self.model.k[int(np.argmin(np.abs(np.log(RATIOS) - np.log(ratio))))])
+        return ratio, k
+
     def systematic(self, b: float, g: float, *, biased: bool) -> dict[str, Any]:
         """Facts of a pixel like most: samples averaged, the spread that comes of where a pixel lies
         in the pattern, which nothing takes off, and if `biased` what noise and blur do."""
-        some = slice(None, None, max(1, self.lit.size // _SOME))
-        step = np.maximum(self.lit.reshape(-1)[some] - self.unlit.reshape(-1)[some], _TINY)
-        ratios = self.deviation.reshape(-1)[some] / step
-        ratio = float(np.clip(np.median(ratios), RATIOS[0], RATIOS[-1]))
-        k = self.k or int(self.model.k[int(np.argmin(np.abs(np.log(RATIOS) - np.log(ratio))))])
+        step = self.lit - self.unlit
+        ratio, k = self._typical(step)
         # L_d and L_g from lit and unlit light
-        solved = np.array([[1.0, -1.0], [-b / g, 1.0 / g]]) * float(np.median(step)) / (1.0 - b)
-        lit, unlit, shared = self._of(("lit_place", "unlit_place", "shared_place"), ratio, k)
+        solved = (
+            np.array([[1.0, -1.0], [-b / g, 1.0 / g]]) * float(np.median(thinned(step))) / (1.0 - b)
+        )
+        lit, unlit, shared = self._of(_PLACE, ratio, k)
         spread = np.diag(solved @ np.array([[lit, shared], [shared, unlit]]) @ solved.T)
         facts: dict[str, Any] = {
             "samples_averaged": k,
@@ -279,9 +316,9 @@ def _estimated(
 
 
 class _Tables:
-    """A model's columns at evenly spaced logarithms of noise over the raw step of `two` samples,
-    for each number of samples averaged in turn: `biases` of lit and of unlit light by the step,
-    `moments` (variances and covariance) by those of a sample's noise."""
+    """A model's columns, for each number of samples averaged in turn, at evenly spaced logarithms
+    of noise over the raw step (of `two` samples). `biases` of lit and of unlit light are parts of
+    the step, `moments` (variances and covariance) multiples of those of a sample's noise."""
 
     def __init__(self, model: OrderErrors, two: int, keep: int) -> None:
         ratios = np.asarray(RATIOS)

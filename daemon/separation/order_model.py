@@ -2,9 +2,9 @@
 
 A pixel under binary patterns takes levels between unlit and lit that depend on where it lies in the
 pattern and on the projector's blur; noise adds to each. The mean of the k brightest samples is then
-too bright by noise and too dark by blur, by amounts that this module finds for the very pattern set
-of a scan: its patterns are blurred, sampled, made noisy (with a fixed seed, so that a result can be
-had again) and ranked.
+too bright by noise and too dark by blur. By how much is simulated for the pattern set of the scan:
+its patterns are blurred, sampled, made noisy (with a fixed seed, so that the same frames give the
+same result) and ranked.
 """
 
 from __future__ import annotations
@@ -17,30 +17,15 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-Plane = NDArray[np.float32]
+from daemon.separation.radiometry import Plane
 
+# Blurs that are simulated, in projector pixels; errors between them are interpolated.
 _KNOTS = (
-    0.0,
-    0.4,
-    0.45,
-    0.5,
-    0.55,
-    0.6,
-    0.65,
-    0.7,
-    0.8,
-    0.9,
-    1.0,
-    1.1,
-    1.2,
-    1.4,
-    1.6,
-    1.8,
-    2.1,
-    2.4,
+    *(0.0, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7),
+    *(0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.6, 1.8, 2.1, 2.4),
 )
 
-_PARTS = 3  # of each interval, errors between knots being interpolated
+_PARTS = 3  # that each interval between knots is tried in
 _TRIED = tuple((at, part / _PARTS) for at in range(len(_KNOTS) - 1) for part in range(_PARTS))
 BLURS = (
     *(round(_KNOTS[at] * (1 - part) + _KNOTS[at + 1] * part, 4) for at, part in _TRIED),
@@ -138,8 +123,8 @@ class OrderModels:
 
         `gaps` (groups, 2, keep - 1) as in `OrderErrors`; `noise` (groups, 2) is that of lit and of
         unlit samples over the raw step; `used` (groups, 2), at least one a group: which gaps count
-        (None: all). Also how many times their noise samples differ by: 1, or if `uneven`, where
-        global light differs from pattern to pattern and from group to group, found as well.
+        (None: all). The second figure is by how many times their noise samples differ: 1, or with
+        `uneven`, where global light differs from pattern to pattern, what fits best.
         """
         share = np.ones(gaps.shape[:2]) if used is None else used.astype(np.float64)
         # misfits are relative to it, for each group to have its say

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import light_model
+from daemon.separation.deviation import stated
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.fading import HALVES, fading
 from daemon.separation.finish import Judgement, bits, finish
 from daemon.separation.handedness import strength
 from daemon.separation.radiometry import FrameMean, Plane, Response
@@ -71,19 +73,23 @@ class ComplementPair:
             self._references, (first + second) * np.float32(0.5), deviation, self._leakage
         )
         direct, indirect = light_model.from_complement_pair(lit, unlit, self._alpha, self._leakage)
-        planes = self._deviations(told, deviation, told.deviation(np.minimum(first, second)))
+        darker = told.deviation(np.minimum(first, second))
+        direct_std, global_std = self._deviations(told, deviation, darker)
         wave, part, noise = self._seen(lit, unlit, deviation)
         mosaic = bool(self._response.bayer)
         between = between_halves(wave, noise)
-        edge = edges(np.abs(wave) * part, noise * part, between, mosaic=mosaic)
+        contrast = np.abs(wave) * part
+        edge = edges(contrast, noise * part, between, mosaic=mosaic)
         total: Plane = direct + indirect
-        split = as_neighbours(direct, total, planes["direct_std"], edge, mosaic=mosaic)
+        of_part = self._of_part(np.maximum(lit, unlit), np.minimum(lit, unlit), deviation, darker)
+        split = as_neighbours(direct, total, of_part, edge, mosaic=mosaic)
         direct, indirect = split.direct, total - split.direct
-        planes["direct_std"], planes["global_std"] = split.stated(
-            planes["direct_std"], planes["global_std"], total, planes["direct_std"]
-        )
-        flags = bits(split.known, Quality.EDGE) | bits(edge & ~split.known, Quality.LOW_MODULATION)
+        noises = split.noise(direct_std, global_std, total, direct_std)
         waves = [wave.astype(np.complex64)]
+        fade = fading(waves[0], contrast, noise * part, direct, total, noises[0], blur=HALVES)
+        planes = stated(*noises, split.deviation, fade.off)
+        flags = bits(split.known, Quality.EDGE) | bits(edge & ~split.known, Quality.LOW_MODULATION)
+        flags |= fade.flags
         strong = strength(waves, noise)
         reflected, mirrors = mirrored(waves, strong, turning=False, smooth=False)
         if reflected is not None:
@@ -112,7 +118,7 @@ class ComplementPair:
                 **mirrors,
                 "edges": round(share, 4),
                 **self._residual(first, second),
-                "advice": advice + told.advice(),
+                "advice": fade.advice + advice + told.advice(),
             },
         )
 
@@ -130,7 +136,7 @@ class ComplementPair:
         part: Plane = np.reciprocal(np.maximum(whole, np.float32(1e-3)))
         return wave, part, noise
 
-    def _deviations(self, told: Told, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
+    def _deviations(self, told: Told, most: Plane, least: Plane) -> tuple[Plane, Plane]:
         """Standard deviations of direct and global from noise where lit and unlit."""
         b, g = self._leakage, light_model.global_weight(self._alpha, self._leakage)
         h = light_model.global_weight(1.0 - self._alpha, b)
@@ -142,12 +148,18 @@ class ComplementPair:
                 share = self._average * (1.0 - b) ** 2 / self._references.frames(kind)
                 unlit_var += np.square(told.deviation(reference)) * np.float32(share)
                 break
-        return {
-            "direct_std": np.hypot(most * np.float32(h), least * np.float32(g))
-            * np.float32(1.0 / singular),
-            "global_std": np.sqrt(unlit_var + np.square(most * np.float32(b)))
-            * np.float32(1.0 / singular),
-        }
+        by = np.float32(1.0 / singular)
+        of_direct: Plane = np.hypot(most * np.float32(h), least * np.float32(g)) * by
+        of_global: Plane = np.sqrt(unlit_var + np.square(most * np.float32(b))) * by
+        return of_direct, of_global
+
+    def _of_part(self, bright: Plane, dark: Plane, most: Plane, least: Plane) -> Plane:
+        """The deviation of direct light's part of all the light, times all the light, by noise in
+        (bright - dark)/(bright + dark)."""
+        whole = np.maximum(bright + dark, most + least)
+        by = np.float32(2.0 / (1.0 - self._leakage)) / np.maximum(whole, np.float32(1e-3))
+        of_part: Plane = np.hypot(dark * most, bright * least) * by
+        return of_part
 
     def _ambient(self, first: Plane, second: Plane) -> tuple[Plane | None, str]:
         """Ambient light; a black frame's leakage is (L_d + L_g) b, and P + I = 2A + (1 + b) times

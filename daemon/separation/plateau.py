@@ -23,24 +23,22 @@ from daemon.separation.radiometry import Plane
 BAND = 1.5
 """Samples so many standard deviations short of a level are averaged; those beyond it all are."""
 
-GOING = 0.003
-"""Deviation of light from the rest of the scene, of the way to the other end, in samples without
-any noise. It goes up and down; but penumbra, which a wider band takes in, adds to an umbra only."""
-
-LEFT = 0.75
-"""Part of the band's width by which its edge may leave the mean behind before that begins again."""
-
-NEAR = 0.1
-"""Samples so far from the second most extreme one, of the way to the other end, count as being
-there; or within the band, if that is wider."""
+NEAR = 0.05
+"""Samples so far from the second most extreme one, of the way to the other end, are averaged too,
+whatever the noise: where things stand close together the rest of the scene's light goes up and down
+by about as much. The frames of penumbra that are within it are few."""
 
 ALONE = 1.5
 """A sample that is so many widths of the band beyond the mean is not of it."""
 
+MEMBERS = 1.25
+"""Deviation of such a mean over that of one of as many samples: which of them are within the band
+is a matter of noise, too (1.02 to 1.39 on simulated and rendered scenes)."""
+
 Part = tuple[slice, slice]
 WHOLE: Part = (slice(None), slice(None))
 
-_KEPT = 2
+_KEPT = 2  # samples of each end that are kept in order: a level begins with them
 _COUNTED = 256  # samples from which on the second most extreme of them is taken for as far off
 _MOST = 65_535  # samples that are counted, and averaged
 _CHUNK = 1 << 15  # samples that are worked on at a time, so that they stay in the cache
@@ -49,9 +47,9 @@ _CHUNK = 1 << 15  # samples that are worked on at a time, so that they stay in t
 class Plateaus:
     """Both ends of each pixel's samples: the levels, and how many samples were there.
 
-    Each band's edge follows the second most extreme sample; the mean begins again when the edge has
-    moved on, so what came before the first full light is forgotten. Constant memory: for each end
-    two planes of the samples' type and four more. Samples are encoded counts.
+    Each band goes with the second most extreme sample; a mean that it leaves behind begins again,
+    so what came before the first full light is forgotten. Constant memory: for each end two planes
+    of the samples' type and two more. Samples are encoded counts.
     """
 
     def __init__(self) -> None:
@@ -99,9 +97,7 @@ class _End:
     def begin(self, samples: NDArray[Any]) -> None:
         """Take the first frame for what there is."""
         self._sum = samples.astype(np.float32)
-        self._near_base = self._sum.copy()  # the edge when counting began
         self._count = np.ones(samples.shape, np.uint16)
-        self._near = np.ones(samples.shape, np.uint16)
 
     def follow(
         self, samples: NDArray[Any], part: Any, span: Plane, deviation: Plane | None
@@ -109,26 +105,18 @@ class _End:
         """Take in a part of a frame that `ranked` has taken in."""
         first, second = (plane[part] for plane in self.ranked.planes)
         edge = second.astype(np.float32)
-        count, near = self._count[part], self._near[part]
-        width = _band(count, spread(second, span, deviation))
-        reach = np.maximum(np.float32(NEAR) * span, width)
-        beyond = (samples.astype(np.float32) - edge) * self._sign
-        within = beyond >= -width
+        count = self._count[part]
+        width = _band(count, span, noise_at(second, deviation))
+        within = (samples.astype(np.float32) - edge) * self._sign >= -width
         within &= count < _MOST
         # arithmetic with masks: NumPy's `where=` takes ten times as long
         self._sum[part] += samples * within
         count += within
-        near += (beyond >= -reach) & (near < _MOST)
 
         # The edge goes outwards, but for the second frame: the first one was its own second.
-        left = np.abs(edge - self._sum[part] / count) > np.float32(LEFT) * width
+        left = np.abs(edge - self._sum[part] / count) > width
         if left.any():
             self._restart(part, left, first, edge, width)
-        afar = np.abs(edge - self._near_base[part]) > reach
-        if afar.any():
-            alone = (first[afar] - edge[afar]) * self._sign > reach[afar]
-            near[afar] = np.where(alone, 1, _KEPT)
-            self._near_base[part][afar] = edge[afar]
 
     def _restart(
         self, part: Any, left: NDArray[np.bool_], first: NDArray[Any], edge: Plane, width: Plane
@@ -142,21 +130,20 @@ class _End:
 
     def level(
         self, deviation: Plane | None, span: Plane, part: Part = WHOLE
-    ) -> tuple[Plane, NDArray[np.uint16], NDArray[np.uint16]]:
-        """The level (float32 counts), how many samples it rests on, and how many were near it.
+    ) -> tuple[Plane, NDArray[np.uint16]]:
+        """The level (float32 counts), and how many samples it rests on.
 
-        A sample beyond the level by a tenth of `span` (float32, counts) and more than noise stands
-        alone: it is taken for the level, which then rests on 1. Raises ValueError with no frames.
+        A sample that is much further out than the others stands alone: it is taken for the level,
+        which then rests on 1. `span` is from one end to the other, float32 counts. Raises
+        ValueError with no frames.
         """
         extreme, count = self.extreme[part], self._count[part]
         mean = np.divide(self._sum[part], count, dtype=np.float32)
-        width = _band(count, spread(extreme, span, deviation))
+        width = _band(count, span, noise_at(extreme, deviation))
         beyond = (extreme.astype(np.float32) - mean) * self._sign
-        alone = beyond > np.maximum(np.float32(NEAR) * span, np.float32(ALONE) * width)
+        alone = beyond > np.float32(ALONE) * width
         level = np.where(alone, extreme, mean).astype(np.float32)
-        one = np.uint16(1)
-        near = np.maximum(self._near[part], count)
-        return level, np.where(alone, one, count), np.where(alone, one, near)
+        return level, np.where(alone, np.uint16(1), count)
 
 
 def _second(count: int) -> float:
@@ -167,19 +154,15 @@ def _second(count: int) -> float:
 _REACHES = np.array([BAND + max(_second(n), 0.0) for n in range(_COUNTED)], dtype=np.float32)
 
 
-def spread(counts: NDArray[Any], span: Plane, deviation: Plane | None) -> Plane:
-    """How far samples of one level lie apart (standard deviation, float32 counts), at the level
-    `counts`. `span` is from one end of the pixel's samples to the other, `deviation` as in
-    `Plateaus.add`."""
-    going = np.float32(GOING) * span
-    if deviation is not None:
-        going = np.hypot(going, np.take(deviation, counts))
-    return np.asarray(going, dtype=np.float32)
+def noise_at(counts: NDArray[Any], deviation: Plane | None) -> Plane | np.float32:
+    """Deviation of a sample at the level `counts`; `deviation` as in `Plateaus.add`."""
+    return np.float32(0) if deviation is None else np.take(deviation, counts)
 
 
-def _band(count: NDArray[np.uint16], apart: Plane) -> Plane:
-    """How far a mean of `count` samples, spread so far, reaches from the second most extreme."""
-    return np.maximum(apart * np.take(_REACHES, count, mode="clip"), np.float32(0.5))
+def _band(count: NDArray[np.uint16], span: Plane, noise: Plane | np.float32) -> Plane:
+    """How far a mean of `count` samples reaches from the second most extreme one."""
+    reach = np.hypot(noise * np.take(_REACHES, count, mode="clip"), np.float32(NEAR) * span)
+    return np.asarray(np.maximum(reach, np.float32(0.5)), dtype=np.float32)
 
 
 def _chunks(shape: tuple[int, ...]) -> Iterator[slice]:

@@ -42,17 +42,14 @@ class References:
     def __init__(self, response: Response) -> None:
         self._response = response
         self._means: dict[Lighting, FrameMean] = {}
-        self._white_saturated: NDArray[np.bool_] | None = None
+        self._saturated: dict[Lighting, NDArray[np.bool_]] = {}
 
     def add(self, pixels: NDArray[Any], lighting: Lighting) -> None:
-        """Take in a frame of one of the kinds ambient, black, white."""
+        """Take in a frame of one of the kinds ambient, black, white, open."""
         self._means.setdefault(lighting, FrameMean(self._response)).add(pixels)
-        if lighting is Lighting.WHITE:
+        if lighting in {Lighting.WHITE, Lighting.OPEN}:
             saturated = pixels >= self._response.saturated_from
-            if self._white_saturated is None:
-                self._white_saturated = saturated
-            else:
-                self._white_saturated |= saturated
+            self._saturated[lighting] = saturated | self._saturated.get(lighting, False)
 
     def mean(self, lighting: Lighting) -> Plane | None:
         """The mean of a kind in linear light, or None without such frames."""
@@ -89,10 +86,10 @@ class References:
         total: Plane = (half - black) * np.float32(weight)
         share = weight**2 / self.frames(Lighting.BLACK)
         whole = self.whole(leakage)
-        if whole is None or self._white_saturated is None:
+        clipped = self.white_saturated
+        if whole is None or clipped is None:
             return Total(total, weight**2, share, "black frame", ((black, share),))
-        if self._white_saturated.any():
-            clipped = self._white_saturated
+        if clipped.any():
             return Total(
                 np.where(clipped, total, whole.light),
                 np.where(clipped, np.float32(weight**2), np.float32(whole.of_half)),
@@ -133,7 +130,12 @@ class References:
     @property
     def white_saturated(self) -> NDArray[np.bool_] | None:
         """Samples that were saturated in a white frame."""
-        return self._white_saturated
+        return self._saturated.get(Lighting.WHITE)
+
+    @property
+    def open_saturated(self) -> NDArray[np.bool_] | None:
+        """Samples that were saturated in an open frame."""
+        return self._saturated.get(Lighting.OPEN)
 
     def ambient_variance(self, told: Told) -> Plane | None:
         """The variance of `ambient`, to first order in the leakage; `told` as in `whole_variance`.
@@ -173,8 +175,9 @@ class References:
         black = reduced(black)
         ambient = light_model.ambient_from_black(black, brightest, darkest, lit_fraction, leakage)
         white = self.mean(Lighting.WHITE)
-        if white is None or self._white_saturated is None or leakage == 0.0:
+        clipped = self.white_saturated
+        if white is None or clipped is None or leakage == 0.0:
             return ambient, "black frame"
-        saturated = reduced(self._white_saturated.astype(np.float32)) > 0
+        saturated = reduced(clipped.astype(np.float32)) > 0
         measured = light_model.ambient_from_black_and_white(black, reduced(white), leakage)
         return np.where(saturated, ambient, measured), "black and white frames"

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from daemon.separation.fineness import finer_pattern
 from daemon.separation.handedness import Wave, WaveSums, imbalance, reversed_pattern, strength
-
-Plane = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from daemon.separation.radiometry import Plane
+from daemon.separation.sampling import Mask
 
 _UNLIKE = 0.1
 """Imbalance of a checkerboard's waves from which the frames are not its shifts."""

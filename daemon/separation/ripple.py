@@ -18,13 +18,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Plane = NDArray[np.float32]
+from daemon.separation.radiometry import Plane
 
-_HARMONICS = 3
+_HARMONICS = 3  # of the phase that are fitted
 _COLLAPSED = 0.8  # of one: what phases add up to that are all alike
 _ENOUGH = 400  # pixels
 _MOST = 100_000  # pixels that are fitted
-_ROUNDS = 5
+_ROUNDS = 5  # of reweighting
 _OUTLYING = 3.0  # deviations, from where on a pixel has no weight
 
 

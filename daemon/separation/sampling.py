@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.estimator import NotYet, Observation
+from daemon.separation.radiometry import Plane
 
-Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_BLOCKS = 8
-_LEAST_PIXELS = 64
+_BLOCKS = 8  # along each side, for a spread over the picture
+_LEAST_PIXELS = 64  # good ones, to say anything
 _MAD = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 
 
@@ -26,6 +26,17 @@ def thinned(plane: NDArray[Any], most: int = 8192) -> NDArray[Any]:
         while np.gcd(step, int(np.prod(plane.shape[1:]))) > 1:
             step += 2
     return flat[::step]
+
+
+def gathered(values: NDArray[Any]) -> float:
+    """Where most of a population lies, though the rest is all to one side: the median of the
+    shortest interval that holds half of it (the shorth's)."""
+    ordered = np.sort(thinned(values))
+    half = ordered.size // 2
+    if half < 2:
+        return float(np.median(ordered))
+    first = int(np.argmin(ordered[half:] - ordered[: ordered.size - half]))
+    return float(np.median(ordered[first : first + half + 1]))
 
 
 class Moments:

@@ -17,9 +17,10 @@ from daemon.separation.estimator import Lighting
 from daemon.separation.noise import Noise, TemporalNoise, from_frame
 from daemon.separation.radiometry import Plane, Response
 
-_SAMPLE = 4
+_SAMPLE = 4  # noise is measured on every fourth row and column
 _ENOUGH = 100  # samples that make a level's deviation
-_LEVELS = 24
+_LEVELS = 24  # of light, at most, with a deviation each
+_FITTED = 3  # phases that a fit takes
 _MORE = 3.0  # times what a picture shows, an upper bound of noise: that is none
 
 
@@ -181,19 +182,20 @@ def told(
 class ResidualNoise:
     """Noise from what a fit of M + B sin(φ + δ) leaves, on every fourth row and column.
 
-    With three phases a fit leaves nothing: repeats of a phase tell it then, or the first picture.
+    With three phases a fit leaves nothing: repeats of a phase tell it then, or the pictures of all
+    three, in whatever order they come.
     """
 
     def __init__(self, response: Response) -> None:
         self._response = response
         self._frequencies: dict[int, _Residuals] = {}
-        self._picture: Noise | None = None
+        self._pictures: list[Noise] = []
         self._bounds = ReferenceNoise(response)
 
     def add(self, pixels: NDArray[Any], light: Plane, frequency: int, delta: float) -> None:
         """Take in a frame (counts and their linear light) of a phase."""
-        if self._picture is None:
-            self._picture = _pictured(self._response, pixels)
+        if len(self._pictures) < _FITTED:
+            self._pictures.append(_pictured(self._response, pixels))
         residuals = self._frequencies.setdefault(frequency, _Residuals())
         residuals.add(light[::_SAMPLE, ::_SAMPLE], delta)
 
@@ -206,18 +208,22 @@ class ResidualNoise:
         fitted = self._fitted()
         if fitted is not None:
             return told(self._response, fitted, RESIDUALS, [fitted], sure=True)
-        if self._picture is None:
+        shown = self._picture
+        if shown is None:
             return told(self._response, None, PICTURE, [])
-        shown = self._bounds.of(self._picture)
+        shown = self._bounds.of(shown)
         return told(self._response, shown, PICTURE, [shown])
+
+    @property
+    def _picture(self) -> Noise | None:
+        return Noise.mean(self._pictures) if self._pictures else None
 
     @property
     def misfit(self) -> float | None:
         """What the fit leaves over what a picture shows: far above 1, frames are no sinusoid."""
         fitted = self._fitted()
-        if fitted is None or self._picture is None:
-            return None
-        return fitted.typical / self._picture.typical
+        shown = self._picture
+        return None if fitted is None or shown is None else fitted.typical / shown.typical
 
     @property
     def distortion(self) -> float | None:

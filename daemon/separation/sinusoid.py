@@ -9,18 +9,19 @@ whichever are missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import log
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import correspondence
-from daemon.separation.blur import of_wave
 from daemon.separation.coordinates import other_axis
+from daemon.separation.deviation import stated
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
+from daemon.separation.fading import PHASES, Faded, fading
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
-from daemon.separation.handedness import STRONG, Wave, strength
+from daemon.separation.handedness import STRONG, strength
+from daemon.separation.periods import agreed
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.references import References
 from daemon.separation.residue import mirrored
@@ -28,16 +29,8 @@ from daemon.separation.ripple import Ripple, ripple
 from daemon.separation.scan_noise import ResidualNoise, Told
 from daemon.separation.steadiness import compare
 from daemon.separation.straddling import Split, as_neighbours, between_phases, edges
-from daemon.separation.weave import Woven
-
-_LEAST_ECCENTRIC = 0.02
-"""Least ratio of the fit's eigenvalues: phases that nearly coincide don't tell M, B, φ apart."""
-
-_DISAGREE = 5.0
-"""Frequencies disagree when their direct components differ by so many standard deviations ..."""
-_DISAGREE_PART = 0.1
-"""... and by this part of the light: a smaller difference is a bend of the projector's curve."""
-
+from daemon.separation.wave_blur import WaveBlur
+from daemon.separation.wave_fit import WaveFit
 
 _MISFIT = 5.0
 """So far above a picture's noise, what the fit leaves is not noise."""
@@ -46,8 +39,7 @@ _DOUBTFUL = 2.0
 _DISTORTED = 0.05
 _BENT = 0.03  # of the wave: with more of it in its amplitude thrice a period, light was no sinusoid
 _ODD = 0.05  # with more of it in mean or amplitude once a period, frames are not of these phases
-_MANY = 0.2  # of the pixels
-_BLURRED = 0.03  # of direct light
+_MANY = 0.1  # of the pixels
 
 
 class LeastSquares:
@@ -82,7 +74,7 @@ class LeastSquares:
         self._known_blur = blur_px
         self._patches = patches
         self._references = References(response)
-        self._fits = [_Fit() for _ in range(1 + max(f for f, _ in phases))]
+        self._fits = [WaveFit() for _ in range(1 + max(f for f, _ in phases))]
         self._noise = ResidualNoise(response)
         self._saturated: NDArray[np.bool_] | None = None
         self._unused = 0
@@ -112,61 +104,50 @@ class LeastSquares:
         if not ready or self._saturated is None:
             raise NotYet("a sinusoid needs 3 phases; they have not all come yet")
         noise = self._noise.told()
-        blur, blur_from = self._blur(ready)
-        solved = [
-            self._separate(fit, noise, self._gain(fit, index, blur))
-            for index, fit in enumerate(ready)
-        ]
-        direct, indirect, direct_var, global_var = _combine(solved)
-        brightest = np.maximum.reduce([fit.brightest() for fit in ready])
-        quality = np.zeros(direct.shape[:2], dtype=np.uint16)
+        blur = WaveBlur.of(ready, self._periods, self._weave, self._known_blur)
+        total, total_var, source = self._total(ready, noise)
+        directs = [self._direct(fit, noise, blur.gain(fit, n)) for n, fit in enumerate(ready)]
+        solved = agreed(directs, self._periods, total)
+        direct, direct_var = solved.direct, solved.direct_var
+        quality = bits(solved.disagree, Quality.DISAGREE)
+        noises = np.sqrt(direct_var), np.sqrt(direct_var + total_var)
+        off = [solved.left, direct * np.float32(blur.doubt)]
         between: dict[str, Any] = {}
+        faded: list[str] = []
         if self._patches:
-            split = self._between_patches(ready[0], noise, direct, indirect, np.sqrt(direct_var))
-            total: Plane = direct + indirect
-            direct, indirect = split.direct, total - split.direct
-            total_std = np.sqrt(np.maximum(global_var - direct_var, np.float32(0.0)))
-            direct_std, global_std = split.stated(
-                np.sqrt(direct_var), np.sqrt(global_var), total, total_std
+            split, fade = self._between_patches(
+                ready[0], noise, direct, total, noises[0], np.sqrt(total_var)
             )
-            direct_var, global_var = np.square(direct_std), np.square(global_std)
-            quality |= bits(split.known, Quality.EDGE)
+            direct = split.direct
+            noises = split.noise(*noises, total, np.sqrt(total_var))
+            off += [split.deviation, fade.off]
+            quality |= bits(split.known, Quality.EDGE) | fade.flags
             between["edges"] = round(float(np.mean(split.known)), 4)
-        if len(solved) > 1:
-            quality |= bits(_disagree(solved), Quality.DISAGREE)
+            faded = fade.advice
+        planes = stated(*noises, *off)
         reflected, told = self._mirrored(ready[0], noise)
         rippled = self._ripple(ready, noise)
         if reflected is not None:
             quality |= bits(reflected, Quality.RESIDUE)
-        doubt = self._doubt(blur)
-        of_blur = np.square(direct * np.float32(doubt))
-        planes: dict[str, NDArray[Any]] = {
-            "direct_std": np.sqrt(direct_var + of_blur),
-            "global_std": np.sqrt(global_var + of_blur),
-        }
         planes.update(self._correspondence(ready))
-        mean = np.add.reduce([fit.solve()[0] for fit in ready]) * np.float32(1.0 / len(ready))
         moved, steady, advice = compare(
-            self._references, mean, self._level(ready[0], noise), self._leakage
+            self._references, _mean(ready), self._level(ready[0], noise), self._leakage
         )
         if moved is not None:
             quality |= moved
         misfit = self._noise.misfit
-        disagreeing = float(np.mean((quality & np.uint16(Quality.DISAGREE)) != 0))
+        disagreeing = float(np.mean(solved.disagree))
         facts: dict[str, Any] = {
             "estimator": "lsq",
             "patterns": sum(fit.frames for fit in self._fits),
             "frequencies": len(ready),
-            "blur_px": None if blur is None else round(blur, 3),
-            "blur_from": blur_from,
-            "blur_unsure": round(doubt, 4),
+            **blur.facts(),
+            "scattering_looked_for": len(ready) > 1 or self._patches,
             "unused_frames": self._unused,
             "lit_fraction": 0.5,
             "leakage": self._leakage,
             **noise.facts(),
-            **self._references.facts(
-                self._references.total(ready[0].solve()[0], self._leakage).source
-            ),
+            **self._references.facts(source),
             **told,
             **steady,
             **between,
@@ -174,7 +155,8 @@ class LeastSquares:
             "ripple": [[round(one.tone, 4), round(one.frames, 4)] for one in rippled],
             "advice": [
                 *_advice(misfit, self._noise.distortion, disagreeing, rippled),
-                *self._unknown(blur),
+                *blur.advice(),
+                *faded,
                 *other_axis({n: planes[n] for n in ("column", "row") if n in planes}),
                 *advice,
                 *noise.advice(),
@@ -182,13 +164,13 @@ class LeastSquares:
         }
         return finish(
             direct,
-            indirect,
+            total - direct,
             response=self._response,
-            brightest=brightest,
+            brightest=np.maximum.reduce([fit.brightest() for fit in ready]),
             saturated=self._saturated,
             judgement=Judgement(
-                direct=np.float32(SIGNIFICANT) * np.sqrt(direct_var),
-                total=np.float32(SIGNIFICANT) * np.sqrt(global_var),
+                direct=np.float32(SIGNIFICANT) * noises[0],
+                total=np.float32(SIGNIFICANT) * noises[1],
                 deviation=self._level(ready[0], noise),
             ),
             flags=quality,
@@ -204,126 +186,71 @@ class LeastSquares:
             "unused": float(self._unused),
         }
 
-    def _blur(self, ready: list[_Fit]) -> tuple[float | None, str]:
-        """The blur of projector and camera together, in projector pixels, and how it is known: from
-        several periods, else as calibrated, else from the weave of one, else (None) it is not.
-
-        Blur of standard deviation s takes exp(-2π²s²f²) from a wave of frequency f, so the ratio of
-        two waves' amplitudes tells s. The median over the scene is taken: scattering within the
-        scene, which is global light, differs from place to place and stays in the amplitudes. A
-        weave has many frequencies in one wave; of plain stripes blur and global light look alike.
-        """
-        if len(ready) != len(self._periods) or not self._periods:
-            return None, ""
-        if len(ready) == 1:
-            if self._known_blur is not None:
-                return self._known_blur, "calibration"
-            woven = self._woven(ready[0], 0)
-            found = None if woven is None else woven.blur(ready[0].grey()[0])
-            return found, "" if found is None else "weave"
-        squares = np.asarray([-4.0 * log(of_wave(0.5, p, self._weave)) for p in self._periods])
-        logs = []
-        first = None
-        for fit in ready:
-            _, cosine, sine = fit.solve()
-            power = (cosine * cosine + sine * sine)[::2, ::2]
-            first = power if first is None else first
-            bright = first >= np.quantile(first, 0.5)  # all where there is no light at all
-            ratio = power[bright] / np.maximum(first[bright], np.float32(1e-12))
-            logs.append(0.5 * float(np.log(np.maximum(np.median(ratio), 1e-6))))
-        slope = np.polyfit(squares, logs, 1)[0] if np.ptp(squares) else 0.0
-        return float(np.sqrt(max(-slope, 0.0))), "scan"
-
-    def _doubt(self, blur: float | None) -> float:
-        """The part of direct light that the blur leaves unsure, as a deviation: a quarter of what
-        it took, for it is one figure for all the scene; unknown, half of what 1 px of it takes."""
-        if not self._periods:
-            return 0.0
-        part, sigma = (0.5, 1.0) if blur is None else (0.25, blur)
-        kept = [of_wave(sigma, period, self._weave) for period in self._periods]
-        return part * (1.0 - sum(kept) / len(kept))
-
-    def _unknown(self, blur: float | None) -> list[str]:
-        """A line where blur may matter and is not known."""
-        if blur is not None or not self._periods:
-            return []
-        taken = 1.0 - min(of_wave(1.0, period, self._weave) for period in self._periods)
-        if taken < _BLURRED:
-            return []
-        return [
-            "the blur of projector and camera is not known, for one period of plain stripes does "
-            f"not tell it: 1 px of it makes direct light {taken:.0%} too small, which counts as "
-            "global; take the pattern with its weave (--weave 1) or a second period "
-            "(--periods 16,24), or run `umbra calibrate leak`"
-            if self._weave == 0.0
-            else "the blur of projector and camera is not known, for too little of the picture "
-            f"tells it, or with too much noise: 1 px of it makes direct light {taken:.0%} too "
-            "small, which counts as global; run `umbra calibrate leak`, or take a second period "
-            "(--periods 16,24)"
-        ]
-
-    def _woven(self, fit: _Fit, index: int) -> Woven | None:
-        if self._weave == 0.0:
-            return None
-        return Woven.of(fit.grey()[1], period=self._periods[index], weave=self._weave)
-
-    def _gain(self, fit: _Fit, index: int, blur: float | None) -> float | Plane:
-        """What gives a wave its amplitude back, of the shape of a frame or one for all."""
-        if not blur or not self._periods:
-            return 1.0
-        woven = self._woven(fit, index)
-        if woven is None:
-            return 1.0 / of_wave(blur, self._periods[index], self._weave)
-        gain = woven.gain(blur)
-        return gain if fit.solve()[0].ndim == 2 else gain[..., None]
-
-    def _separate(
-        self, fit: _Fit, noise: Told, gain: float | Plane
-    ) -> tuple[Plane, Plane, Plane, Plane]:
-        """Direct, global and their variances from one frequency."""
+    def _direct(self, fit: WaveFit, noise: Told, gain: float | Plane) -> tuple[Plane, Plane]:
+        """Direct light and its variance from one frequency."""
         mean, cosine, sine = fit.solve()
-        b = self._leakage
         power = cosine * cosine + sine * sine
-        of_mean, of_wave = noise.wave_deviations(mean, np.sqrt(power))
-        mean_var, wave_var = fit.variances()
+        _, of_wave = noise.wave_deviations(mean, np.sqrt(power))
+        _, wave_var = fit.variances()
         if noise.measured:
             # |B| of noise alone is not 0: to first order its square is too large by one variance.
             power = np.maximum(power - np.float32(wave_var) * of_wave * of_wave, 0)
-        amplitude: Plane = np.sqrt(power)
-        of_amplitude = np.asarray(gain, np.float32) * np.float32(2.0 / (1.0 - b))
-        direct: Plane = amplitude * of_amplitude
-        total = self._references.total(mean, b)
-        indirect: Plane = total.light - direct
-        direct_var: Plane = np.square(of_wave * of_amplitude) * np.float32(wave_var)
-        total_var = total.of_references(noise.deviation)
-        total_var += np.square(of_mean) * np.asarray(mean_var * total.of_half, dtype=np.float32)
-        return direct, indirect, direct_var, direct_var + total_var
+        of_amplitude = np.asarray(gain, np.float32) * np.float32(2.0 / (1.0 - self._leakage))
+        direct: Plane = np.sqrt(power) * of_amplitude
+        variance: Plane = np.square(of_wave * of_amplitude) * np.float32(wave_var)
+        return direct, variance
+
+    def _total(self, ready: list[WaveFit], noise: Told) -> tuple[Plane, Plane, str]:
+        """L_d + L_g and its variance from all frequencies and references, and what they are."""
+        mean = _mean(ready)
+        total = self._references.total(mean, self._leakage)
+        variance = total.of_references(noise.deviation)
+        for fit in ready:
+            own, cosine, sine = fit.solve()
+            of_mean, _ = noise.wave_deviations(own, np.hypot(cosine, sine))
+            by = fit.variances()[0] / len(ready) ** 2 * total.of_half
+            variance += np.square(of_mean) * np.asarray(by, dtype=np.float32)
+        return total.light, variance, total.source
 
     def _between_patches(
-        self, fit: _Fit, noise: Told, direct: Plane, indirect: Plane, deviation: Plane
-    ) -> Split:
-        """Random phases: what the edges of patches have too little of, see `straddling`."""
+        self,
+        fit: WaveFit,
+        noise: Told,
+        direct: Plane,
+        total: Plane,
+        direct_std: Plane,
+        total_std: Plane,
+    ) -> tuple[Split, Faded]:
+        """Random phases: what the edges of patches have too little of, and what scattering leaves
+        unsure, see `straddling` and `fading`."""
         mean, wave = fit.grey()
         light: Plane = np.maximum(mean, np.float32(1e-3))
         contrast: Plane = np.asarray(np.abs(wave) / light, dtype=np.float32)
         between = between_phases(wave)
         mosaic = bool(self._response.bayer)
-        edge = edges(contrast, self._grey_noise(fit, noise) / light, between, mosaic=mosaic)
-        return as_neighbours(direct, direct + indirect, deviation, edge, mosaic=mosaic)
+        own = self._grey_noise(fit, noise) / light
+        edge = edges(contrast, own, between, mosaic=mosaic)
+        part = np.clip(direct / np.maximum(total, np.float32(1e-3)), 0, 1)
+        of_part = np.hypot(direct_std, part * total_std)
+        split = as_neighbours(direct, total, of_part, edge, mosaic=mosaic)
+        fade = fading(wave, contrast, own, split.direct, total, direct_std, blur=PHASES)
+        return split, fade
 
-    def _grey_noise(self, fit: _Fit, noise: Told) -> Plane:
+    def _grey_noise(self, fit: WaveFit, noise: Told) -> Plane:
         """Of the wave's amplitude (H, W), colours added."""
         one = self._level(fit, noise) * np.float32(fit.variances()[1] ** 0.5)
         return one if one.ndim == 2 else np.asarray(np.sqrt(np.square(one).sum(axis=2)), np.float32)
 
-    def _mirrored(self, fit: _Fit, noise: Told) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
+    def _mirrored(
+        self, fit: WaveFit, noise: Told
+    ) -> tuple[NDArray[np.bool_] | None, dict[str, Any]]:
         """Where the phase runs against the picture's, or changes faster: see `residue`."""
         _, wave = fit.grey()
         deviation = self._level(fit, noise) * np.float32(np.sqrt(2.0 * fit.variances()[1]))
         even = bool(self._periods)
         return mirrored([wave], strength([wave], deviation), turning=even, smooth=even)
 
-    def _ripple(self, ready: list[_Fit], noise: Told) -> list[Ripple]:
+    def _ripple(self, ready: list[WaveFit], noise: Told) -> list[Ripple]:
         """How much of the wave shows in its own mean and amplitude, where three phases leave no
         residuals to say so."""
         found = []
@@ -337,11 +264,11 @@ class LeastSquares:
                 found.append(known)
         return found
 
-    def _level(self, fit: _Fit, noise: Told) -> Plane:
+    def _level(self, fit: WaveFit, noise: Told) -> Plane:
         mean, _, _ = fit.solve()
         return noise.deviation(mean)
 
-    def _correspondence(self, ready: list[_Fit]) -> dict[str, NDArray[Any]]:
+    def _correspondence(self, ready: list[WaveFit]) -> dict[str, NDArray[Any]]:
         """Wrapped phase of the first frequency, and where the projector lit each pixel."""
         waves = []
         for fit in ready:
@@ -357,84 +284,10 @@ class LeastSquares:
         return planes
 
 
-class _Fit:
-    """Sums of one frequency: ΣI, ΣI cos δ, ΣI sin δ, and those of the design."""
-
-    def __init__(self) -> None:
-        self._sums: Plane | None = None
-        self._scaled: Plane | None = None
-        self._normal = np.zeros((3, 3))
-        self.frames = 0
-
-    def add(self, light: Plane, delta: float) -> None:
-        if self._sums is None or self._scaled is None:
-            self._sums = np.zeros((3, *light.shape), dtype=np.float32)
-            self._scaled = np.empty_like(light)
-        row = np.array([1.0, np.cos(delta), np.sin(delta)])
-        self._sums[0] += light
-        for index in (1, 2):
-            np.multiply(light, np.float32(row[index]), out=self._scaled)
-            self._sums[index] += self._scaled
-        self._normal += np.outer(row, row)
-        self.frames += 1
-
-    @property
-    def solvable(self) -> bool:
-        if self.frames < 3:
-            return False
-        values = np.linalg.eigvalsh(self._normal)
-        return bool(values[0] > _LEAST_ECCENTRIC * values[-1])
-
-    def solve(self) -> tuple[Plane, Plane, Plane]:
-        """M, and the factors of cos δ and sin δ: B sin φ, B cos φ."""
-        assert self._sums is not None, "only a solvable fit is solved"
-        inverse = np.linalg.inv(self._normal).astype(np.float32)
-        found = np.tensordot(inverse, self._sums, axes=1)
-        return found[0], found[1], found[2]
-
-    def grey(self) -> tuple[Plane, Wave]:
-        """M and the wave as a complex number (H, W), colours added."""
-        mean, cosine, sine = self.solve()
-        wave = np.asarray(cosine + 1j * sine, dtype=np.complex64)
-        if wave.ndim == 3:
-            return mean.sum(axis=2), np.asarray(wave.sum(axis=2), dtype=np.complex64)
-        return mean, wave
-
-    def variances(self) -> tuple[float, float]:
-        """Variance of M and of one factor of the wave for samples of variance 1."""
-        inverse = np.linalg.inv(self._normal)
-        return float(inverse[0, 0]), float((inverse[1, 1] + inverse[2, 2]) / 2)
-
-    def brightest(self) -> Plane:
-        """Light at the crest of the fitted wave."""
-        mean, cosine, sine = self.solve()
-        crest: Plane = mean + np.hypot(cosine, sine)
-        return crest
-
-
-def _combine(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> tuple[Plane, Plane, Plane, Plane]:
-    """The mean over frequencies; their frames are independent and equally many."""
-    if len(solved) == 1:
-        return solved[0]
-    direct, indirect, direct_var, global_var = (
-        np.add.reduce(planes) * np.float32(1.0 / len(solved))
-        for planes in zip(*solved, strict=True)
-    )
-    share = np.float32(1.0 / len(solved))
-    return direct, indirect, direct_var * share, global_var * share
-
-
-def _disagree(solved: list[tuple[Plane, Plane, Plane, Plane]]) -> NDArray[np.bool_]:
-    """Where the direct components of any two frequencies differ by more than noise explains."""
-    directs = np.stack([one[0] for one in solved])
-    variance = np.maximum.reduce([one[2] for one in solved])
-    total = np.maximum.reduce([one[0] + one[1] for one in solved])
-    apart = directs.max(axis=0) - directs.min(axis=0)
-    limit = np.maximum(
-        np.float32(_DISAGREE * np.sqrt(2.0)) * np.sqrt(variance), np.float32(_DISAGREE_PART) * total
-    )
-    differ = apart > limit
-    return differ if differ.ndim == 2 else np.asarray(np.logical_or.reduce(differ, axis=2))
+def _mean(fits: list[WaveFit]) -> Plane:
+    """Light under half of the source."""
+    mean: Plane = np.add.reduce([fit.solve()[0] for fit in fits]) * np.float32(1.0 / len(fits))
+    return mean
 
 
 def _advice(
@@ -463,8 +316,9 @@ def _advice(
         )
     if disagreeing > _MANY:
         lines.append(
-            f"the periods give different direct light in {disagreeing:.0%} of the pixels: the "
-            "frames are not the phases and periods that were declared (--phases, --periods), or "
-            "the coarser patterns are too coarse for this scene"
+            f"the periods give different direct light in {disagreeing:.0%} of the pixels: light is "
+            "scattered or reflected over less than a period there, and direct may be too large by "
+            "about the stated deviation (finer --periods tell), or the frames are not the phases "
+            "and periods that were declared (--phases, --periods)"
         )
     return lines

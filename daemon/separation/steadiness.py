@@ -23,15 +23,15 @@ from daemon.separation.sampling import thinned
 HALF = 0.02
 """Lit fractions so near to a half are one."""
 
-_DEVIATIONS = 6.0
+_DEVIATIONS = 6.0  # of noise, and ...
 _PART = 0.1  # of the light: less is a bend of a tone curve, or light that was not smooth
 _OFF = 0.02  # of the light, all over the picture
 _WHOLLY_OFF = 0.1  # from here nothing is said of single pixels
 _OVER = 0.005  # leakage above what the black frame allows
 _NOTED = 0.01  # of direct light, by which leakage may be wrong: it is said
 _PLAIN = 0.05  # relative spread of K/W below which it is no room's light
-_SPECK = 3
-_CALM = 9
+_SPECK = 3  # pixels a side: what is smaller is noise
+_CALM = 9  # pixels a side over which light is averaged
 
 
 def compare(

@@ -27,6 +27,7 @@ _LIFTED = 1.0  # deviations, at least, by which noise lifts the largest of so ma
 _ALIKE = 0.95  # length of the mean of phases that are alike
 _NOISE = 1.3  # times what noise makes of a neighbourhood's variance, which is told to a fifth
 _REACHES = (5, 9, 17)  # pixels across, within which whole neighbours are looked for
+_SHARED = 1.5  # times the noise of neighbours that samples share which a colour is made from
 _SOME = 0.1  # of the weight there must be theirs
 
 
@@ -58,30 +59,33 @@ def edges(contrast: Plane, noise: Plane, between: Mask, *, mosaic: bool) -> Mask
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """`direct` of a frame's shape with the neighbours' part of the light at edges; `deviation`: how
-    much neighbours differ in that, beyond noise; `known`: the edges (H, W) that have neighbours."""
+    """`direct` of a frame's shape with the neighbours' part of the light at edges, and how much of
+    their noise is in it (`brought`, elsewhere 0); `deviation`: how much neighbours differ in that,
+    beyond noise; `known`: the edges (H, W) that have neighbours."""
 
     direct: Plane
+    brought: Plane
     deviation: Plane
     known: Mask
 
-    def stated(
+    def noise(
         self, direct_std: Plane, global_std: Plane, total: Plane, total_std: Plane
     ) -> tuple[Plane, Plane]:
-        """Deviations of both components: at edges those of parts of the total, elsewhere as given;
-        and how much neighbours differ."""
+        """Deviations of both components by noise: at edges those of parts of the total, and what
+        the neighbours brought, elsewhere as given."""
         part: Plane = np.clip(self.direct / np.maximum(total, np.float32(1e-3)), 0.0, 1.0)
         known = _as(self.known, part)
         of_direct: Plane = np.where(known, part * total_std, direct_std)
         of_global: Plane = np.where(known, (np.float32(1.0) - part) * total_std, global_std)
-        return np.hypot(of_direct, self.deviation), np.hypot(of_global, self.deviation)
+        return np.hypot(of_direct, self.brought), np.hypot(of_global, self.brought)
 
 
 def as_neighbours(direct: Plane, total: Plane, noise: Plane, edge: Mask, *, mosaic: bool) -> Split:
     """Give edges (H, W) the part of `total` that is direct in the nearest pixels which are none.
 
-    `noise` is the standard deviation of `direct`. The deviation is that of the pixels beside edges
-    too, for a contrast that is a little short is not told from a whole one.
+    `noise` is the standard deviation of `direct` at a given `total`, that is of its part. The
+    deviation is that of the pixels beside edges too, for a contrast that is a little short is not
+    told from a whole one.
     """
     light: Plane = np.maximum(total, np.float32(0.0))
     weight: Plane = light * _as(~edge, light).astype(np.float32)
@@ -89,7 +93,8 @@ def as_neighbours(direct: Plane, total: Plane, noise: Plane, edge: Mask, *, mosa
     part: Plane = np.clip(direct * by, 0.0, 1.0)
     of_noise = np.float32(_NOISE) * np.square(np.minimum(noise * by, np.float32(1.0)))
     square: Plane = np.square(part) - of_noise
-    found, deviation = direct.copy(), np.zeros_like(direct)
+    found, brought, deviation = direct.copy(), np.zeros_like(direct), np.zeros_like(direct)
+    own = np.square(noise * _as(~edge, light))
     left = _near(edge)
     for reach in _REACHES:
         kernel, wider = (_bell(size, mosaic=mosaic) for size in (reach, 2 * reach - 1))
@@ -100,8 +105,11 @@ def as_neighbours(direct: Plane, total: Plane, noise: Plane, edge: Mask, *, mosa
         deviation[at] = (np.sqrt(np.maximum(spread, np.float32(0.0))) * light)[at]
         at &= _as(edge, light)
         found[at] = (mean * light)[at]
+        sums = np.maximum(cv2.filter2D(weight, -1, kernel), np.float32(1e-3))
+        error = np.sqrt(np.maximum(cv2.filter2D(own, -1, np.square(kernel)), 0)) / sums
+        brought[at] = (error * light * np.float32(_SHARED if mosaic else 1.0))[at]
         left &= ~here
-    return Split(found, deviation, edge & ~left)
+    return Split(found, brought, deviation, edge & ~left)
 
 
 def _mean(plane: Plane, weight: Plane, kernel: Plane) -> Plane:

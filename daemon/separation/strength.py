@@ -31,7 +31,7 @@ _GROWN = 1.05  # a place that has become brighter by more was not in full light 
 _STILL = 0.01  # share of the places that may still do so when full light is known
 _LIT = 0.9  # of the brightest: samples that are averaged as full light
 _REACHES = (0.08, 0.05)  # half widths of the windows that go to a peak's middle, of ln(ratio)
-_ROUNDS = 12
+_ROUNDS = 12  # of looking for a peak
 _LEAST = 20  # places in a window that tell anything
 
 

@@ -9,6 +9,7 @@ may be global.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,6 +23,7 @@ Mask = NDArray[np.bool_]
 _KEPT = 0.95
 """A stripe resolves a pixel that has at least this part of the best contrast ..."""
 _NOISE = np.float32(2.0)  # ... less so many deviations of a frame
+_REACHES = np.linspace(0.0, 6.0, 25)
 _AROUND = 9  # pixels
 _LIT = np.float32(0.1)  # of the picture's strong contrast: with less a pixel says nothing of blur
 _DIFFERENT = 5.0
@@ -31,11 +33,12 @@ _PART = np.float32(0.1)  # ... and by this part of the light
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """`contrast` of a frame's shape, mean of `count` (H, W) stripes, of which the finest is `width`
-    (H, W) wide; `spread` (H, W): how much stripes differ; `disagree` (H, W): by far too much."""
+    """`contrast` of a frame's shape, a mean of stripes of which the finest is `width` (H, W) wide;
+    `scatter` (H, W): its noise as a part of one stripe's; `spread` (H, W): how much stripes differ;
+    `disagree` (H, W): by far too much."""
 
     contrast: Plane
-    count: Plane
+    scatter: Plane
     width: NDArray[np.uint16]
     spread: Plane
     disagree: Mask
@@ -65,13 +68,35 @@ def resolved(
     wider = _wider(greys, widths, best)
     of_wider = np.float32(2.0 / _AROUND) * noise  # that of a mean over the pixels around
     limit = np.maximum(np.float32(_DIFFERENT) * of_wider, _PART * _grey(whole))
+    may = enough - _NOISE * _grey(deviation)
+    among = np.add.reduce([(grey >= may).astype(np.intp) for grey in greys])
+    reach = (best - enough) / np.maximum(np.float32(2**0.5) * noise, np.float32(1e-6))
     return Resolved(
         contrast=total / (count if total.ndim == 2 else count[..., None]),
-        count=count,
+        scatter=_scatter(among, reach),
         width=width,
         spread=np.hypot(np.sqrt(np.maximum(apart, np.float32(0.0))), wider),
         disagree=np.asarray(wider > limit),
     )
+
+
+def _scatter(among: NDArray[np.intp], reach: Plane) -> Plane:
+    """The noise of a mean of those of so many alike that lie within a reach, in deviations of one,
+    of the best of them: noise chooses them, so that it is more than that of all."""
+    found = np.ones(reach.shape, dtype=np.float32)
+    for n in range(2, int(among.max()) + 1):
+        at = among == n
+        found[at] = np.interp(reach[at], _REACHES, _chosen(n))
+    return found
+
+
+@functools.lru_cache
+def _chosen(count: int) -> NDArray[np.float64]:
+    """By simulation, for each reach of `_REACHES`."""
+    drawn = np.random.default_rng(0).standard_normal((20_000, count))
+    short = drawn.max(axis=1, keepdims=True) - drawn
+    means = [np.mean(drawn, axis=1, where=short <= reach) for reach in _REACHES]
+    return np.asarray(np.std(means, axis=1))
 
 
 def _wider(greys: Sequence[Plane], widths: Sequence[int], best: Plane) -> Plane:

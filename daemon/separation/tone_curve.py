@@ -19,8 +19,8 @@ from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
 from daemon.separation.sampling import Mask, Turns, bright, ratio
 
-_LEVELS = 255
-_DRIFT = 0.02
+_LEVELS = 255  # the projector's highest
+_DRIFT = 0.02  # of the lamp's light, from the first white to the last: worth a line of advice
 
 
 class ToneCurve:

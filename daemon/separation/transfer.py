@@ -11,7 +11,7 @@ from daemon.separation.estimator import Curve, Measurement, NotYet, Observation,
 from daemon.separation.radiometry import Response
 from daemon.separation.sampling import line
 
-_LEVELS = 64
+_LEVELS = 64  # bins of counts that pairs of samples are sorted into
 _ENOUGH = 400  # samples that make a level
 _TOP = 0.9  # of the scale: above, noise is cut off
 _ROUNDING = 1.0 / 12.0

@@ -32,27 +32,33 @@ _PART = 0.1  # of the light: an error of more than both is flagged
 _MANY = 0.08  # of the pixels: it is said
 _TINY = np.float32(1e-6)
 _SAID = (
-    "in {:.1%} of the pixels light is not the same under patterns of one lit fraction: it is "
-    "scattered or reflected over less than a checker or patch there, and direct may be too large "
-    "by about the stated deviation; finer patterns (--checker, --patch) tell"
+    "in {:.1%} of the pixels light is not the same under patterns of one lit fraction, and direct "
+    "may be off, most of all too large, by about the stated deviation: light is scattered or "
+    "reflected over less than a checker or patch there (finer patterns tell: --checker, --patch), "
+    "or the projector is out of focus, or something moved"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Uneven:
-    """`planes`: the deviations of components, and what is uneven; `flags` (H, W), uint16: where it
-    is much; `advice`: a line where that is many pixels."""
+    """`off`: how far components may be off for it, as a deviation, of a frame's shape; `flags`
+    (H, W), uint16: where it is much; `advice`: a line where that is many pixels."""
 
-    planes: dict[str, Plane]
+    off: Plane
     flags: NDArray[np.uint16]
     advice: list[str]
+
+    @classmethod
+    def unknown(cls, plane: Plane) -> Uneven:
+        """Of a plane's shape, where one sample is kept at each end."""
+        return cls(np.zeros_like(plane), np.zeros(plane.shape[:2], dtype=np.uint16), [])
 
 
 def unevenness(
     low: Plane,
     high: Plane,
     noise: Plane,
-    planes: dict[str, Plane],
+    known: Plane,
     patterns: int,
     *,
     shifted: bool,
@@ -60,22 +66,22 @@ def unevenness(
     """What the ranks of samples differ by beyond noise and what is usual in the scene.
 
     `low`, `high` (K, H, W[, 3]): the light of the darkest and brightest samples of so many
-    patterns, the most extreme first; `noise` (H, W[, 3]): the deviation of a sample; `planes`:
-    those of the components by noise alone. All float32. `shifted`: each pixel has been at every
+    patterns, the most extreme first; `noise` (H, W[, 3]): the deviation of a sample; `known`: the
+    larger of those of the components by noise. All float32. `shifted`: each pixel has been at every
     place of one pattern; under random patches blur moves those at edges, and not the others.
     """
     error = _error(low, high, noise, patterns, _BOX if shifted else _PATCHES)
-    known = np.maximum.reduce(list(planes.values()))
     much = error > np.maximum(np.float32(_DEVIATIONS) * known, np.float32(_PART) * high[0])
-    pixels = much if much.ndim == 2 else np.logical_or.reduce(much, axis=2)
+    pixels = much if much.ndim == 2 else by_light(much, high[0])
     flags = bits(pixels, Quality.DISAGREE)
     part = float(np.mean(pixels))
-    square = np.square(error)
-    return Uneven(
-        {name: np.sqrt(np.square(plane) + square) for name, plane in planes.items()},
-        flags,
-        [_SAID.format(part)] if part > _MANY else [],
-    )
+    return Uneven(error, flags, [_SAID.format(part)] if part > _MANY else [])
+
+
+def by_light(much: NDArray[np.bool_], light: Plane) -> NDArray[np.bool_]:
+    """Where colours that hold a third of the light are uneven. A fainter one may be what a
+    camera's correction of colours leaves of the others."""
+    return np.asarray((much * light).sum(axis=2) * 3 >= light.sum(axis=2))
 
 
 def _error(low: Plane, high: Plane, noise: Plane, patterns: int, across: int) -> Plane:

@@ -29,9 +29,9 @@ from protocol.patterns import AnyPattern
 
 REACH = 8
 """Camera pixels around a point that are looked at, each way."""
-_FITTED = 5
-_LEAST_FITTED = 12
-_OUTLIER_PX = 1.5
+_FITTED = 5  # camera pixels each way that the code is fitted over
+_LEAST_FITTED = 12  # of them, to tell the point
+_OUTLIER_PX = 1.5  # projector pixels from the fitted plane
 _NEAR_PX = 0.5
 """Samples that look so near the middle of the patch are read; with the blur known, also ..."""
 _NEAR_BLURRED_PX = 1.0

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from daemon.separation.blur import blurred_wave, of_wave
 from daemon.separation.handedness import Wave
+from daemon.separation.sampling import gathered
 
 Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -51,7 +52,7 @@ class Woven:
         self._usable = (self._strong > 0) & filled
         # the pixel's own and its neighbours': their noise is not the same one, so that products of
         # the two are free of its square
-        own = _rates(self._wave)
+        own = rates(self._wave)
         near = _beside(own[0], down=True), _beside(own[1], down=False)
         typical = self._mean(own[0] * near[0] + own[1] * near[1])
         self._typical = np.maximum(typical, np.float32(1e-4))
@@ -64,7 +65,7 @@ class Woven:
         strong = amplitude > np.float32(_STRONG) * np.quantile(amplitude[::4, ::4], 0.9)
         if not strong.any():
             return None
-        rate = float(np.sqrt(np.median(_square(_rates(wave))[strong])))
+        rate = float(np.sqrt(np.median(_square(rates(wave))[strong])))
         step = max(1, round(2.0 * pi / max(rate, 1e-3) / _PERIOD))
         if rate * step > _COARSEST or min(wave.shape) < step * _WINDOW:
             return None
@@ -90,7 +91,7 @@ class Woven:
         if windows < _ENOUGH:
             return None
         found = going[alike] / spread[alike]
-        slope = float(np.median(found))
+        slope = float(gathered(found))
         error = 1.25 * 1.4826 * float(np.median(np.abs(found - slope))) / windows**0.5
         if error > _SURE:
             return None
@@ -119,7 +120,7 @@ class Woven:
         return mean
 
 
-def _rates(wave: Wave) -> tuple[Plane, Plane]:
+def rates(wave: Wave) -> tuple[Plane, Plane]:
     """Radians a pixel along rows and along columns, (H, W); 0 at the border."""
     along, down = (np.zeros(wave.shape, dtype=np.float32) for _ in range(2))
     along[:, 1:-1] = np.angle(wave[:, 2:] * np.conj(wave[:, :-2])) * np.float32(0.5)

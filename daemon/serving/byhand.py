@@ -18,7 +18,7 @@ from daemon.pictures import picture
 from daemon.pictures.viewfinder import facts_of
 from daemon.runs.calibration import Calibrations
 from daemon.runs.runner import LOCK, Runner
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import response_of
 from daemon.serving.server import Answer, Asked
 from daemon.storage.store import Store
 from drivers.base.camera import CameraSettings as DriverSettings

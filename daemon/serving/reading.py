@@ -105,9 +105,11 @@ class Reading:
 
     def _result_of(self, run: RunFolder) -> tuple[Result, dict[str, Any]]:
         """Of a run under way: so far; of one that has ended: as its products have it."""
-        for course in (self._runner.course, self._reprocessor.current):
-            if course is not None and course.folder.id == run.id and not run.file.products:
-                found = course.result()
+        for execution in (self._runner.under_way, self._reprocessor.under_way):
+            if execution is None or execution.folder.id != run.id:
+                continue
+            if not run.file.products:
+                found = execution.result()
                 return found, found.facts
         measurement = measured.read(run)
         return (measurement, measurement.facts) if measurement else separated.read(run)

@@ -28,9 +28,9 @@ from protocol.messages.commands import AnyCommand
 from protocol.messages.envelopes import PROTOCOL, Preamble, Request, Response
 from protocol.messages.replies import AnyReply
 
-_REMEMBERED = 1024
-_REMEMBERED_BYTES = 64 << 20
-_ID_LIMIT = 64
+_REMEMBERED = 1024  # answers that a repeated request finds ...
+_REMEMBERED_BYTES = 64 << 20  # ... of so many bytes together
+_ID_LIMIT = 64  # characters of an id that is given back with an error
 
 log = structlog.get_logger(__name__)
 

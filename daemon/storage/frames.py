@@ -15,9 +15,6 @@ import re
 import shutil
 import zlib
 from array import array
-from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +26,7 @@ from daemon.separation.estimator import Observation
 from daemon.storage import journal
 from daemon.storage.durable import FULL, Damaged, atomic_write, fsync_file, fsync_folder, storage
 from daemon.storage.journal import Journal
+from daemon.storage.ledger import Ledger
 from daemon.storage.shards import Layout
 from protocol.errors import Code, UmbraError
 from protocol.patterns import AnyPattern
@@ -132,6 +130,21 @@ class FrameStore:
         if not readonly:
             store._lines = Journal(folder / LINES)
         return store
+
+    @classmethod
+    def begin(
+        cls,
+        folder: Path,
+        shape: tuple[int, ...],
+        dtype: DTypeLike,
+        *,
+        pixels: bool,
+        resuming: bool,
+    ) -> FrameStore:
+        """The store of a run that begins, or (`resuming`) goes on where it has frames already."""
+        if resuming and (folder / LINES).exists():
+            return cls.open(folder)
+        return cls.create(folder, shape, dtype, pixels)
 
     # ------------------------------------------------------------ writing
 
@@ -319,24 +332,14 @@ def _write(path: Path, parts: list[memoryview | bytes]) -> None:
         raise
 
 
-@dataclass(frozen=True, slots=True)
-class Count:
-    """What a run's folder holds; `exposing` is the sum of the records'."""
-
-    recorded: int = 0
-    missing: int = 0
-    exposing: Mapping[str, int] = field(default_factory=dict)
-
-
-def count(folder: Path) -> Count:
+def count(folder: Path) -> Ledger:
     """What is in a run's folder, for what a crash left; nothing if there are no frames yet, or
     they are unreadable: `FrameStore.open` says what is wrong."""
+    ledger = Ledger()
     try:
         records = journal.read(folder / LINES, FrameRecord)
     except UmbraError:
-        return Count()
-    missing = sum(bool(record.missing) for record in records)
-    exposing: Counter[str] = Counter()
+        return ledger
     for record in records:
-        exposing.update(record.exposing)
-    return Count(len(records) - missing, missing, dict(exposing))
+        ledger.note(record)
+    return ledger

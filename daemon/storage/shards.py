@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from daemon.storage.durable import Damaged, storage
 
-_BAND = 1 << 20
+_BAND = 1 << 20  # bytes of an inner chunk, about
 _DTYPES = ("uint8", "uint16")
 
 

@@ -5,7 +5,7 @@ controller.py  what is at the end of the line: identity, settings, travel
 condition.py   what is known of the stage: alarms, resets, where it is
 homing.py      the way to a known position, and out of an alarm
 standstill.py  hold, resume, stop
-motion.py      motions as lines, the limits that they keep to, the stream that carries them
+motion.py      motions as lines, the stream that carries them
 link.py        the conversation: lines and their acknowledgements, reports, resets
 protocol.py    what a controller says, as data
 faults.py      alarms and errors by name

@@ -1,4 +1,4 @@
-"""Motions as lines of G-code, the limits that they keep to, and the stream that carries them.
+"""Motions as lines of G-code, and the stream that carries them.
 
 Straight lines go to absolute machine positions (G53): work offsets do not matter. Arcs cannot (Grbl
 refuses G53 with them) and are incremental: whole turns end where they began, so nothing adds up,
@@ -10,14 +10,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
 
-from drivers.base.errors import DeviceRefused
-from drivers.base.stage import StageInfo
 from drivers.grbl.link import GrblLink
-from drivers.track import Arc, Point
-
-Range = tuple[float, float]
+from drivers.track import Point
 
 MODES = "G21G17G94G90"  # mm, XY plane, feed in mm/min, absolute: set after each reset
 
@@ -53,44 +48,6 @@ def arcs(radius_mm: float, feed_mm_s: float, turns: float) -> Iterator[str]:
         end = math.tau * (turns - done)
         dx, dy = r * (math.cos(end) - 1), r * math.sin(end)
         yield f"G91G3X{dx:.4f}Y{dy:.4f}I{-r:.4f}J0{feed}"
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What is checked before anything is sent. Each check raises DeviceRefused."""
-
-    device: str
-    info: StageInfo
-
-    def check_feed(self, phase: str, feed: float) -> None:
-        """`feed` in mm/s."""
-        most = self.info.max_feed_mm_s
-        if not 0 < feed <= most * (1 + 1e-9):
-            raise DeviceRefused(
-                self.device, phase, f"a feed of {feed:g} mm/s", f"it takes up to {most:g} mm/s"
-            )
-
-    def check_box(self, phase: str, x: Range, y: Range) -> None:
-        """That all of it is within the travel; names the axis, the value and the limit."""
-        for axis, box, travel in zip("xy", (x, y), self.info.travel_mm, strict=True):
-            for value in box:
-                if not travel[0] <= value <= travel[1]:  # false for nan too
-                    raise DeviceRefused(
-                        self.device,
-                        phase,
-                        f"{axis} = {value:g} mm is outside {travel[0]:g} to {travel[1]:g} mm, its "
-                        "travel",
-                        "nothing was sent; aim within the travel",
-                    )
-
-    def check_circle(self, phase: str, arc: Arc, turns: float) -> None:
-        """The whole circle, however little of it is gone round."""
-        (x, y), r = arc.centre, arc.radius
-        if not (math.isfinite(r) and r > 0):
-            raise DeviceRefused(self.device, phase, f"its radius is {r} mm", "above 0")
-        if not turns > 0:
-            raise DeviceRefused(self.device, phase, f"{turns} turns were asked", "above 0")
-        self.check_box(phase, (x - r, x + r), (y - r, y + r))
 
 
 class Stream:

@@ -25,7 +25,8 @@ from drivers.grbl.condition import Condition
 from drivers.grbl.controller import Range
 from drivers.grbl.homing import Homing
 from drivers.grbl.link import REPLY_S, GrblLink
-from drivers.grbl.motion import Limits, Stream, arcs, jog, line
+from drivers.grbl.motion import Stream, arcs, jog, line
+from drivers.limits import Limits
 from drivers.serialport import SerialPort, attached
 from drivers.track import Arc, Point
 
@@ -72,7 +73,6 @@ class GrblStage(Stage):
         self._homing = Homing(self._condition, self._stop)
         self._controller = controller.NOBODY
         self._info: StageInfo | None = None
-        self._identity: Identity | None = None
 
     @classmethod
     def discover(cls) -> list[dict[str, Any]]:
@@ -85,7 +85,7 @@ class GrblStage(Stage):
         """Open, wait for the banner, identify, read the settings. The position is unknown then.
 
         Safe to try again. Raises DeviceLost (no such port), DeviceTimeout (nothing answers),
-        DeviceGarbled (not Grbl), DeviceRefused (taken, too old, or another controller).
+        DeviceGarbled (not Grbl), DeviceRefused (taken, too old, or not the one named).
         """
         self.close()
         self._link.open(self.options.boot_s)
@@ -98,7 +98,6 @@ class GrblStage(Stage):
         except DeviceError:
             self.close()
             raise
-        self._identity = identity
         return identity
 
     def _identify(self) -> Identity:
@@ -107,17 +106,7 @@ class GrblStage(Stage):
         link.rx_bytes = it.rx_bytes
         link.scale = grbl.MM_PER_INCH if it.inches else 1.0
         usb = link.port.identity
-        identity = Identity(str(it.firmware), (usb.serial if usb else "") or it.label, it.version)
-        before = self._identity
-        if before is not None and before.serial and identity.serial != before.serial:
-            raise DeviceRefused(
-                self.name,
-                "connect",
-                f"another controller ({identity.serial or 'unnamed'}) has come back in the place "
-                f"of {before.serial}",
-                "restore the cabling, or restart the daemon if it was exchanged on purpose",
-            )
-        return identity
+        return Identity(str(it.firmware), (usb.serial if usb else "") or it.label, it.version)
 
     def _limits(self) -> StageInfo:
         """Travel, feed and acceleration from the controller and the options; see `info`."""

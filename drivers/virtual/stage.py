@@ -97,6 +97,7 @@ class VirtualStage(VirtualDevice, Stage):
         """See Device."""
         return {
             "virtual": True,
+            "homed": self._state in {StageState.IDLE, StageState.HELD},
             "occluder": self._o.occluder.value,
             "hole_fraction": self.occluder.hole_fraction,
             "light": self.shades,

@@ -12,10 +12,10 @@ import typer
 from protocol.cli.delivery import write_file
 from protocol.cli.link import Json, Keys, Rig, connect
 from protocol.cli.options import build, options_of, with_options
-from protocol.cli.output import print_facts, print_json, say
+from protocol.cli.output import print_done, print_facts, print_json, say
 from protocol.cli.preview import png_name, say_facts
 from protocol.errors import Code, UmbraError
-from protocol.messages.replies import Camera, Done, Picture
+from protocol.messages.replies import Camera, Picture
 from protocol.messages.rig import CameraSettings
 
 if TYPE_CHECKING:
@@ -147,7 +147,4 @@ def light(
     """
     with connect(rig, keys) as client:
         client.light(name, switch is Switch.ON)
-    if as_json:
-        print_json(Done(message=f"{name} {switch.value}"))
-    else:
-        print(f"{name} {switch.value}")
+    print_done(f"{name} {switch.value}", as_json=as_json)

@@ -13,6 +13,8 @@ from typing import Any, TextIO
 
 import msgspec
 
+from protocol.messages.replies import Done
+
 
 def on_terminal(stream: TextIO | None = None) -> bool:
     """Whether a person looks at the stream (standard output if none is named)."""
@@ -23,6 +25,14 @@ def print_json(fact: Any, *, lines: bool = False) -> None:
     """A struct of the protocol as JSON: indented, or one a line for streams of them."""
     encoded = msgspec.json.encode(fact)
     print((encoded if lines else msgspec.json.format(encoded, indent=2)).decode(), flush=True)
+
+
+def print_done(message: str, said: str = "", *, as_json: bool) -> None:
+    """That something was done: as a Done, or for people, who may be `said` more."""
+    if as_json:
+        print_json(Done(message=message))
+    else:
+        print(said or message)
 
 
 COLOURS = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +11,7 @@ import typer
 from protocol.cli.link import Json, Keys, Rig, RunId, connect
 from protocol.cli.output import (
     on_terminal,
+    print_done,
     print_facts,
     print_json,
     print_table,
@@ -26,7 +26,7 @@ from protocol.errors import Code, UmbraError
 from protocol.following import SILENCE_S
 from protocol.messages.events import Logged
 from protocol.messages.findings import Search
-from protocol.messages.replies import Devices, Discovered, Done, Log, Status
+from protocol.messages.replies import Devices, Discovered, Log, Status
 from protocol.messages.rig import DeviceInfo
 from protocol.messages.runs import RunState
 
@@ -56,8 +56,9 @@ def _status_lines(now: Status, server: str) -> list[tuple[str, str]]:
         ("state", now.state.value),
     ]
     for device in now.devices:
-        model = " ".join(part for part in (device.model or device.driver, device.message) if part)
-        lines.append((device.name, f"{device.health.value} · {model}"))
+        model = " · ".join(part for part in (device.model or device.driver, device.message) if part)
+        homed = ", not homed" if device.facts.get("homed") is False else ""
+        lines.append((device.name, f"{device.health.value}{homed} · {model}"))
     if now.run is not None:
         told = f"{now.run.state.value} · {now.run.id}: {method(now.run)}, {frames(now.run)}"
         if now.progress is not None and now.progress.rate_hz:
@@ -258,10 +259,7 @@ def stop(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
     """
     with connect(rig, keys) as client:
         client.estop()
-    if as_json:
-        print_json(Done(message="stopped"))
-    else:
-        print("stopped; `umbra reset` ends the emergency stop", file=sys.stdout)
+    print_done("stopped", "stopped; `umbra reset` ends the emergency stop", as_json=as_json)
 
 
 def reset(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
@@ -271,7 +269,4 @@ def reset(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
     """
     with connect(rig, keys) as client:
         client.reset()
-    if as_json:
-        print_json(Done(message="reset"))
-    else:
-        print("reset; the queue goes on")
+    print_done("reset", "reset; the queue goes on", as_json=as_json)

@@ -8,8 +8,7 @@ import typer
 
 from protocol.cli.family import Family
 from protocol.cli.link import Json, Keys, Rig, connect
-from protocol.cli.output import print_json
-from protocol.messages.replies import Done
+from protocol.cli.output import print_done
 from protocol.patterns import BLACK, WHITE, AnyPattern
 
 Lease = Annotated[
@@ -28,10 +27,7 @@ def show(
     """Show this pattern."""
     with connect(rig, keys) as client:
         client.show(pattern, lease_s)
-    if as_json:
-        print_json(Done(message="shown"))
-    else:
-        print(f"shown for {lease_s:g} s; umbra show off ends it")
+    print_done("shown", f"shown for {lease_s:g} s; umbra show off ends it", as_json=as_json)
 
 
 def white(
@@ -52,10 +48,7 @@ def off(rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
     """End manual work: projector dark, lights off, stage held."""
     with connect(rig, keys) as client:
         client.dark()
-    if as_json:
-        print_json(Done(message="dark"))
-    else:
-        print("dark")
+    print_done("dark", as_json=as_json)
 
 
 class Patterns(Family):

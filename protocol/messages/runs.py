@@ -13,7 +13,7 @@ from protocol.scans.anyscan import AnyScan
 class RunState(enum.StrEnum):
     """Where a run is in its life.
 
-        queued ──> waiting ──> running <──> paused
+        queued ──> waiting <─> running <──> paused
            │          │          │ │          │
            │          │          │ └────┬─────┘
            │          │          v      v
@@ -23,8 +23,8 @@ class RunState(enum.StrEnum):
            └──────────┴──> aborted;  waiting ──> failed
 
     `waiting`: for what it needs before its first frame (`Progress.waits`); left out where all is
-    there. `interrupted` is what a restart makes of a run that was under way; one that waited is
-    queued again.
+    there; and again for a device that fails later, where a deadline says so. `interrupted` is what
+    a restart makes of a run that was under way; one that waited is queued again.
     """
 
     QUEUED = "queued"

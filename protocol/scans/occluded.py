@@ -81,7 +81,8 @@ class Stick(OccluderScan, frozen=True, kw_only=True, tag="stick"):
 
 class Mesh(OccluderScan, frozen=True, kw_only=True, tag="mesh"):
     """A grid of holes on a small circle, on video (§4.2): α is the hole fraction β, b = 0 in the
-    umbra. β is told, or follows from the mesh, or is measured: places are lit for β of the time.
+    umbra. β is told, or follows from the mesh's holes and pitch, or is measured by how much of the
+    time places are lit.
     """
 
     hole_fraction: (

@@ -60,8 +60,8 @@ class Ready(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         Meta(
             ge=0,
             le=7 * 86_400,
-            description="seconds to wait for all that a run needs before its first frame; "
-            "0: it must be so at once",
+            description="seconds to wait for all that a run needs before its first frame, and "
+            "for a device that fails later; 0: it must be so at once",
         ),
     ] = 0.0
     light_min: (

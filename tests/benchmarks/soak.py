@@ -164,11 +164,13 @@ def _end(info: RunInfo) -> str:
         return info.state.value
     if info.state is not RunState.DONE:
         return f"{info.state.value}: {info.end.code}"
-    for words in ("wanted:", "wanted", "time limit"):
+    for words, end in (
+        ("time limit", "done: time limit"),
+        ("wanted:", "done: no more to cover"),
+        ("wanted", "done: covered"),
+    ):
         if words in info.end.reason:
-            return {"wanted:": "done: no more to cover", "wanted": "done: covered"}.get(
-                words, "done: time limit"
-            )
+            return end
     return "done"
 
 

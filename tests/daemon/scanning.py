@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from numpy.typing import NDArray
 
 from daemon.scans import catalog
-from daemon.scans.method import Bench, Expose, Taken
-from daemon.separation.estimator import Components
+from daemon.scans.method import Bench, Expose, Taken, Watch
+from daemon.separation.estimator import Components, Observation
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from protocol.scans.anyscan import AnyScan
@@ -30,6 +30,23 @@ def scanned(spec: AnyScan, bench: Bench, expose: Callable[[Expose], NDArray[Any]
     found = estimator.result()
     assert isinstance(found, Components)
     return method.conclude(found)
+
+
+def watched(
+    spec: AnyScan, bench: Bench, frames: Iterable[NDArray[Any]]
+) -> tuple[Components, list[Observation]]:
+    """The whole of a video under an occluder, and what each frame was used for."""
+    method = catalog.method_for(spec, bench)
+    step = method.step(0, {})
+    assert isinstance(step, Watch)
+    estimator, decided = method.estimator(), []
+    for k, frame in enumerate(frames):
+        observation = method.observe(step, Taken(0, k, incomplete=False, pixels=frame))
+        estimator.update(frame, observation)
+        decided.append(observation)
+    found = estimator.result()
+    assert isinstance(found, Components)
+    return method.conclude(found), decided
 
 
 def declared(spec: AnyScan, frames: Sequence[NDArray[Any]]) -> Components:

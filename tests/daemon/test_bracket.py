@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -13,11 +12,11 @@ from daemon.scans.method import Bench, Expose, Taken, Unsuitable
 from daemon.scans.pattern_scan import PatternMethod
 from daemon.separation import mosaic
 from daemon.separation.bracket import Bracketed, merge
+from daemon.separation.deviation import of_noise
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.exposure_noise import ExposureNoise, Sample, Sensor
 from daemon.separation.pair import ComplementPair
 from daemon.separation.radiometry import FrameMean, Response
-from daemon.separation.sinusoid import LeastSquares
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
@@ -343,9 +342,9 @@ def test_highlights_come_back_with_every_method(spec: AnySeparation) -> None:
     if not isinstance(spec, SingleImage):
         direct, others = truth()
         true = mosaic.demosaic(direct, "RG") + mosaic.demosaic(others, "RG")
-        off, was = (np.median(np.abs(w - true)[bright]) for w in (whole, lost))
+        off, was = (np.sqrt(np.mean(np.square((w - true)[bright]))) for w in (whole, lost))
         assert off < 0.04 * np.median(true[bright])
-        assert off < 0.5 * was or off < 0.015 * np.median(true[bright])
+        assert off < 0.35 * was
 
 
 def test_a_dim_scene_has_less_noise() -> None:
@@ -359,31 +358,21 @@ def test_a_dim_scene_has_less_noise() -> None:
     assert spreads[1] < 0.55 * spreads[0]  # five times the light
 
 
-@pytest.fixture
-def _noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Repeated scans do not show what an unsure blur adds to the deviations of sinusoids."""
-    monkeypatch.setattr(LeastSquares, "_doubt", lambda *_: 0.0)
-
-
 @pytest.mark.parametrize(
     "spec",
-    [TwoImage(checker=16), Sinusoid(phases=8)],
+    [TwoImage(), Sinusoid(phases=8), GrayCode(), RandomPhase(phases=4)],
     ids=lambda s: type(s).__name__,
 )
-@pytest.mark.usefixtures("_noise_alone")
 def test_the_stated_deviation_is_the_real_one(spec: AnySeparation) -> None:
     count = 6
     scans = [SCENE.scan(with_bracket(spec, BRACKET), seed=seed) for seed in range(count)]
     assert scans[0].facts["noise_from"] == "exposures compared"
     good = np.all([(scan.quality & np.uint16(UNSURE)) == 0 for scan in scans], axis=0)
-    edge = np.any([(scan.quality & np.uint16(Quality.EDGE)) != 0 for scan in scans], axis=0)
-    good &= cv2.dilate(edge.astype(np.uint8), np.ones((7, 7))) == 0  # more than noise is stated
-    assert good.mean() > 0.1
     light = np.mean([scan.direct + scan.global_ for scan in scans], axis=0)[good]
     third, twothirds = np.quantile(light, [1 / 3, 2 / 3])
     for name, plane in (("direct", "direct_std"), ("global_", "global_std")):
         real = np.stack([getattr(scan, name) for scan in scans]).var(axis=0, ddof=1)[good]
-        stated = np.stack([scan.planes[plane] for scan in scans]).mean(axis=0)[good]
+        stated = np.stack([of_noise(scan.planes, plane) for scan in scans]).mean(axis=0)[good]
         for part in (light < third, light >= twothirds):  # few exposures there, many here
             mean = np.median(real[part]) / (1 - 2 / (9 * (count - 1))) ** 3
             assert 0.8 < np.median(stated[part]) / np.sqrt(mean) < 1.25, name

@@ -66,6 +66,15 @@ def test_dark_tells_the_black_level_from_light_that_still_arrives() -> None:
     assert "cover the lens" in measured.facts["advice"][0]
 
 
+def test_a_camera_that_does_not_expose_as_told_is_named() -> None:
+    estimator = Dark(4095, 3)
+    for _ in range(3):
+        for n in range(4):
+            estimator.update(shot(SCENE), Observation(last=n == 3, exposure_us=10_000.0))
+    with pytest.raises(NotYet, match="it exposed for 10 ms each time, whatever it was told"):
+        estimator.result()
+
+
 def test_photon_transfer_finds_gain_and_read_noise() -> None:
     estimator = PhotonTransfer(RESPONSE)
     for level in range(1, 7):

@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import pytest
 
-from daemon import config
 from daemon.config import SequencerSection
 from daemon.devices.devicethread import Revoked, Session
 from daemon.devices.lightmeter import LightMeter, require_meterable
@@ -27,26 +26,15 @@ from daemon.exposing.sequencer import Sequencer, exposer_for
 from daemon.exposing.video import Video
 from daemon.scans.catalog import method_for
 from daemon.scans.method import Circle, Expose, Method, Unsuitable, Watch
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import response_of
 from drivers.base.camera import CameraSettings
 from drivers.clock import NS, Clock
 from protocol.messages.runs import RunState
 from protocol.scans.projected import TwoImage
 from protocol.scans.spec import Radiometry
+from tests.daemon.small_rig import small_rig
 
-RIG = """
-[rig]
-time_scale = 20
-[projector]
-driver = "virtual"
-width = 64
-height = 48
-[camera]
-driver = "virtual"
-width = 64
-height = 48
-noise = false
-{camera}
+STAGE_AND_LAMP = """
 [stage]
 driver = "virtual"
 homing_feed_mm_s = 200
@@ -110,6 +98,11 @@ class Stand:
     method: Method[Any]
     apparatus: Apparatus
     paused: threading.Event = field(default_factory=threading.Event)
+    on_pause: Callable[[], None] = lambda: None
+
+    def pauses(self) -> None:
+        self.paused.set()
+        self.on_pause()
 
     def dark(self) -> bool:
         """Whether the projector gives no light now."""
@@ -121,31 +114,29 @@ class Stand:
 @pytest.fixture
 def stand(request: pytest.FixtureRequest) -> Iterator[Stand]:
     given: dict[str, Any] = getattr(request, "param", {})
-    parsed = config.parse(RIG.format(camera=given.get("camera", "")), "test")
-    rig = Rig(parsed, lambda _: None)
-    rig.connect()
-    session, control = rig.take("test"), Control()
-    info = rig.camera.device.info()
-    ring = Ring(given.get("ring", 4), info.shape, info.pixel_format.dtype)
-    tape = Tape(ring, gives=given.get("gives", True))
-    method = method_for(TwoImage(average=3), rig.bench())
-    made: list[Stand] = []
-    apparatus = Apparatus(
-        rig=rig,
-        session=session,
-        control=control,
-        method=method,
-        recorder=cast(Recorder, tape),
-        ring=ring,
-        patience=SequencerSection(),
-        may_go_on=lambda: None,
-        on_pause=lambda _: made[0].paused.set(),
-        taken=0,
-    )
-    made.append(Stand(rig, control, session, tape, method, apparatus))
-    yield made[0]
-    rig.leave(session)
-    rig.close()
+    camera = "noise = false\n" + given.get("camera", "")
+    with small_rig(time_scale=20, camera=camera, more=STAGE_AND_LAMP) as rig:
+        session, control = rig.take("test"), Control()
+        info = rig.camera.device.info()
+        ring = Ring(given.get("ring", 4), info.shape, info.pixel_format.dtype)
+        tape = Tape(ring, gives=given.get("gives", True))
+        method = method_for(TwoImage(average=3), rig.bench())
+        made: list[Stand] = []
+        apparatus = Apparatus(
+            rig=rig,
+            session=session,
+            control=control,
+            method=method,
+            recorder=cast(Recorder, tape),
+            ring=ring,
+            patience=SequencerSection(),
+            may_go_on=lambda: None,
+            on_pause=lambda _: made[0].pauses(),
+            taken=0,
+        )
+        made.append(Stand(rig, control, session, tape, method, apparatus))
+        yield made[0]
+        rig.leave(session)
 
 
 @pytest.fixture
@@ -358,12 +349,12 @@ def test_time_in_a_pause_is_not_time_of_the_video(stand: Stand) -> None:
         if frames == 10:
             stand.control.pause("lunch")
 
-    def resume(_: str) -> None:
+    def resume() -> None:
         clock.skipped_ns = round(hour_s * NS)
         stand.control.resume()
 
     stand.tape.on_put = pause
-    stand.apparatus._on_pause = resume
+    stand.on_pause = resume
     watched = watch(stand, 30)
     assert clock.skipped_ns > 0
     assert watched.seconds[-1] < hour_s / 2

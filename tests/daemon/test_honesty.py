@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from daemon.separation.deviation import of_noise
 from daemon.separation.estimator import Quality
-from daemon.separation.sinusoid import LeastSquares
 from protocol.scans.anyscan import AnySeparation
 from protocol.scans.projected import (
     Checkerboard,
     GrayCode,
     RandomBinary,
+    RandomPhase,
     SingleImage,
     Sinusoid,
     TwoImage,
@@ -25,21 +26,16 @@ SCANS = 6
 UNSURE = Quality.SATURATED | Quality.DARK | Quality.LOW_MODULATION | Quality.RESIDUE
 
 
-@pytest.fixture(autouse=True)
-def _noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Repeated scans do not show what an unsure blur adds to the deviations of sinusoids."""
-    monkeypatch.setattr(LeastSquares, "_doubt", lambda *_: 0.0)
-
-
 def _ratios(scene: Scene | VirtualScene, spec: AnySeparation) -> dict[str, float]:
-    """Stated over real deviation of direct and of global: medians over good pixels."""
+    """Stated over real deviation of direct and of global by noise, which is what repeated scans
+    show: medians over good pixels."""
     scans = [scene.scan(spec, seed=seed) for seed in range(SCANS)]
     good = np.all([(scan.quality & np.uint16(UNSURE)) == 0 for scan in scans], axis=0)
     assert good.mean() > 0.2
     found = {}
     for name, plane in (("direct", "direct_std"), ("global_", "global_std")):
         real = np.stack([getattr(scan, name) for scan in scans]).var(axis=0, ddof=1)[good]
-        stated = np.stack([scan.planes[plane] for scan in scans]).mean(axis=0)[good]
+        stated = np.stack([of_noise(scan.planes, plane) for scan in scans]).mean(axis=0)[good]
         mean = np.median(real) / (1 - 2 / (9 * (SCANS - 1))) ** 3  # of a χ², from its median
         found[name] = float(np.median(stated) / np.sqrt(mean))
     return found
@@ -72,6 +68,33 @@ def test_what_blur_does_is_stated_too(spec: AnySeparation, blur: float) -> None:
     off = np.abs(found.direct - scene.direct) / found.planes["direct_std"]
     assert 0.5 < np.median(off) / 0.6745 < 1.8
     assert np.mean(off > 5) < 0.02
+
+
+@pytest.mark.parametrize("blur", [0.0, 0.6, 1.2])
+@pytest.mark.parametrize(
+    "spec",
+    [
+        Checkerboard(estimator="maxmin", radiometry=LIGHT),
+        Checkerboard(estimator="topk", radiometry=LIGHT),
+        RandomBinary(estimator="maxmin", radiometry=LIGHT),
+        RandomBinary(estimator="topk", radiometry=LIGHT),
+        TwoImage(radiometry=LIGHT),
+        RandomPhase(radiometry=LIGHT),
+        GrayCode(radiometry=LIGHT),
+        Sinusoid(phases=5, periods=(12, 20), radiometry=LIGHT),
+    ],
+)
+def test_it_is_that_of_the_error(spec: AnySeparation, blur: float) -> None:
+    """Against the truth: noise, bias, place in the pattern, edges and blur together."""
+    scene = Scene(sigma=0.02, leakage=0.02, ambient=0.03, blur=blur)
+    found = scene.scan(spec)
+    inside = np.s_[8:-8, 8:-8]
+    for plane, truth, name in (
+        (found.direct, scene.direct, "direct_std"),
+        (found.global_, scene.indirect, "global_std"),
+    ):
+        error = np.mean(np.square(plane - truth)[inside])
+        assert 0.75 < np.sqrt(error / np.mean(np.square(found.planes[name][inside]))) < 1.4, name
 
 
 @pytest.mark.parametrize("spec", [Sinusoid(phases=8, radiometry=LIGHT), GrayCode(radiometry=LIGHT)])

@@ -101,6 +101,18 @@ def test_a_full_disk_takes_nothing_and_can_be_tried_again(
     assert numbers(path) == [1, 2]
 
 
+def commit_with_failing_fsync(
+    journal: Journal, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(descriptor: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", failing)
+        with pytest.raises(StorageError):
+            journal.commit()
+
+
 def test_a_disk_that_is_found_full_by_fsync_can_be_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,13 +121,7 @@ def test_a_disk_that_is_found_full_by_fsync_can_be_tried_again(
     journal = Journal(path)
     journal.append(Line(2))
 
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(StorageError):
-            journal.commit()
+    commit_with_failing_fsync(journal, errno.ENOSPC, monkeypatch)
     assert numbers(path) == [1], "what was not acknowledged is not there"
     journal.commit()
     assert numbers(path) == [1, 2]
@@ -127,12 +133,6 @@ def test_after_a_failed_fsync_it_promises_nothing_more(
     journal = Journal(tmp_path / "j.jsonl")
     journal.append(Line(1))
 
-    def broken(descriptor: int) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", broken)
-        with pytest.raises(StorageError):
-            journal.commit()
+    commit_with_failing_fsync(journal, errno.EIO, monkeypatch)
     with pytest.raises(Damaged, match="open it again"):
         journal.commit()

@@ -8,37 +8,21 @@ from typing import Any
 import pytest
 
 import daemon.manual.manual
-from daemon import config
 from daemon.devices.rig import Rig
 from daemon.devices.snapshot import snap
 from daemon.manual.manual import Manual
 from daemon.pictures.viewfinder import Viewfinder
-from daemon.scans.pattern_scan import response_of
+from daemon.scans.parameters import response_of
 from drivers.base.camera import CameraSettings
 from protocol.patterns import WHITE
 from protocol.scans.spec import Radiometry
-
-RIG = """
-[rig]
-time_scale = 4
-[projector]
-driver = "virtual"
-width = 64
-height = 48
-[camera]
-driver = "virtual"
-width = 64
-height = 48
-faults = ["incomplete-frame@1"]
-"""
+from tests.daemon.small_rig import small_rig
 
 
 @pytest.fixture
 def rig() -> Iterator[Rig]:
-    made = Rig(config.parse(RIG, "test"), lambda _: None)
-    made.connect()
-    yield made
-    made.close()
+    with small_rig(time_scale=4, camera='faults = ["incomplete-frame@1"]') as made:
+        yield made
 
 
 @pytest.fixture

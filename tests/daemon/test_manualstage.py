@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import pytest
 
@@ -13,7 +14,7 @@ from daemon.manual.manual import Manual
 from daemon.manual.manualstage import ManualStage
 from daemon.pictures.viewfinder import Viewfinder
 from drivers.base.errors import DeviceLost, DeviceRefused
-from protocol.errors import UmbraError
+from protocol.errors import Code, UmbraError
 from protocol.messages.events import StageChanged
 from protocol.messages.rig import Health, StageState
 
@@ -52,16 +53,22 @@ def told() -> Told:
     return Told()
 
 
+@contextmanager
+def by_hand(told: Told, options: str = "") -> Iterator[ManualStage]:
+    rig = Rig(config.parse(RIG + options, "test"), lambda _: None)
+    rig.connect()
+    stage = Manual(rig, Viewfinder(lambda _: None), lambda: None, told).stage
+    yield stage
+    stage.finish()
+    rig.close()
+
+
 @pytest.fixture
 def stage(told: Told) -> Iterator[ManualStage]:
-    rig = Rig(config.parse(RIG, "test"), lambda _: None)
-    rig.connect()
-    by_hand = Manual(rig, Viewfinder(lambda _: None), lambda: None, told).stage
-    by_hand.home(1000.0)
-    told.at_rest()
-    yield by_hand
-    by_hand.finish()
-    rig.close()
+    with by_hand(told) as stage:
+        stage.home(1000.0)
+        told.at_rest()
+        yield stage
 
 
 def followers() -> int:
@@ -94,13 +101,26 @@ def test_what_is_refused_leaves_a_stage_that_stands(stage: ManualStage, told: To
     told.at_rest()
 
 
-def test_homing_is_ended_by_stop_only(stage: ManualStage) -> None:
-    stage.move(400.0, 200.0, 200.0)
-    stage.home(1000.0)
-    for other in (stage.unlock, lambda: stage.move(1.0, 1.0, 10.0), lambda: stage.home(9.0)):
-        with pytest.raises(UmbraError, match="homing: wait for its end, or `umbra stage stop`"):
-            other()
-    assert stage.stop().state is StageState.UNKNOWN
+def test_homing_is_ended_by_stop_only(told: Told) -> None:
+    with by_hand(told, "homing_feed_mm_s = 0.001") as stage:  # 20 minutes
+        stage.home(1e6)
+        for other in (stage.unlock, lambda: stage.move(1.0, 1.0, 10.0), lambda: stage.home(9.0)):
+            with pytest.raises(UmbraError, match="homing: wait for its end, or `umbra stage stop`"):
+                other()
+        assert stage.stop().state is StageState.UNKNOWN
+
+
+def test_nothing_moves_that_is_not_homed(told: Told) -> None:
+    with by_hand(told) as stage:
+        with pytest.raises(UmbraError, match="position is not known; home it") as caught:
+            stage.move(10.0, 10.0, 50.0)
+        assert caught.value.code is Code.WRONG_STATE
+        stage._thread.device.faults.inject("no-switch", act="home")  # type: ignore[attr-defined]
+        stage.home(1000.0)
+        told.until(lambda: told.states[-1:] == [StageState.ALARM])
+        with pytest.raises(UmbraError, match="limit switch X was not found") as caught:
+            stage.circle((200.0, 150.0), 10.0, 100.0, None)
+        assert caught.value.code is Code.WRONG_STATE
 
 
 def test_a_stage_that_is_lost_meanwhile_is_known_to_be(stage: ManualStage) -> None:

@@ -153,6 +153,47 @@ def test_an_open_frame_tells_ambient_and_global_apart() -> None:
     assert found.facts["ambient_from"] == "open frame"
 
 
+def test_with_an_open_and_an_ambient_frame_it_matters_not_what_the_mesh_left_unshaded() -> None:
+    """Of the global light a third comes from places beyond the mesh's shadow."""
+    direct, indirect = scene()
+    beyond = 3000.0
+    frames = circle(COVERING, noise=100.0, ambient=AMBIENT + beyond)
+    whole = direct + indirect + AMBIENT + beyond
+    references = {Lighting.AMBIENT: np.full((HEIGHT, WIDTH), AMBIENT), Lighting.OPEN: whole}
+    alone = separate(frames, references={Lighting.AMBIENT: references[Lighting.AMBIENT]})
+    assert np.nanmedian(alone.global_ - indirect) > beyond / MESH.hole_fraction
+    for beta in (MESH.hole_fraction, 0.6):
+        found = separate(frames, beta, references)
+        assert np.nanmedian(found.global_ - indirect) == pytest.approx(beyond, abs=100.0)
+        assert found.facts["ambient_from"] == "open and ambient frames"
+
+
+def test_where_an_open_frame_is_saturated_it_tells_nothing() -> None:
+    direct, indirect = scene()
+    whole = direct + indirect + AMBIENT
+    spot = np.s_[10:20, 10:20]
+    whole[spot] = 65535.0
+    ambient = np.full((HEIGHT, WIDTH), AMBIENT)
+    frames = circle(COVERING, ambient=AMBIENT)
+    found = separate(frames, references={Lighting.AMBIENT: ambient, Lighting.OPEN: whole})
+    assert max(errors(found)) < 60.0
+
+
+@pytest.mark.parametrize("noise", [100.0, 1000.0])
+def test_what_noise_leaves_in_the_components_is_stated(noise: float) -> None:
+    frames = circle(COVERING)
+    rng = np.random.default_rng(6)
+    scans = [
+        separate([counts(f + rng.normal(0, noise, f.shape)) for f in frames]) for _ in range(5)
+    ]
+    lit = scene()[0] > 0
+    for name, plane in (("direct", "direct_std"), ("global_", "global_std")):
+        real = np.std([getattr(scan, name) for scan in scans], axis=0, ddof=1)[lit]
+        stated = np.mean([scan.planes[plane] for scan in scans], axis=0)[lit]
+        assert 0.8 < np.nanmedian(stated) / (np.nanmedian(real) / 0.833) < 1.25
+    assert "direct_std" not in separate(frames, averaged=False).planes
+
+
 def test_the_hole_fraction_is_the_part_of_the_time_that_places_are_lit() -> None:
     found = separate(circle(COVERING, ambient=AMBIENT), None)
     assert found.facts["hole_fraction"] == pytest.approx(MESH.hole_fraction, rel=0.03)

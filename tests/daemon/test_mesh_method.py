@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from daemon.scans.catalog import method_for
@@ -67,7 +69,8 @@ def test_it_ends_when_covered_or_out_of_time() -> None:
     method, _ = planned(replace_spec(KNOWN, coverage=0.9, time_limit_s=60.0))
     assert method.enough({"coverage": 0.5}, 10.0) == ""
     assert method.enough({"coverage": 0.93}, 10.0).startswith("93.0% of the lit pixels")
-    assert method.enough({"coverage": 0.5}, 61.0).startswith("the time limit of 60 s, at 50.0%")
+    assert method.enough({"coverage": 0.5}, 61.0).startswith("the time limit of 60 s: 50.0% of")
+    assert not method.short()
 
 
 def test_a_circle_that_covers_no_more_ends_after_some_turns_in_use() -> None:
@@ -89,19 +92,43 @@ def test_a_circle_that_covers_no_more_ends_after_some_turns_in_use() -> None:
     assert seconds > 12 * turn_s
 
 
-def test_lost_frames_are_named_where_coverage_ends() -> None:
-    method, motion = planned(replace_spec(KNOWN, feed_mm_s=40.0))
+def lossy(every: int, spec: Mesh = KNOWN) -> tuple[MeshMethod, str, int]:
+    """A scan whose coverage does not grow from .97 on, of which one frame in `every` arrives; why
+    it ended, and after how many."""
+    method, motion = planned(replace_spec(spec, feed_mm_s=40.0))
     step = method.step(0, {})
     assert step is not None
-    for k in range(30):
-        seen = method.observe(step, Taken(0, k, incomplete=True))
-        assert (seen.used, seen.reason) == (False, "lost frame")
     turn_s = math.tau * motion.radius_mm / motion.feed_mm_s
-    said = ""
-    for k in range(1000):
-        said = said or method.enough({"frames": k, "coverage": 0.97}, k * turn_s / 50)
-    assert "covered no more, but 30 of 30 frames were lost" in said
+    for k in range(100_000):
+        pixels = None if k % every else np.zeros((48, 64), np.uint16)
+        seen = method.observe(step, Taken(0, k, incomplete=pixels is None, pixels=pixels))
+        assert seen.reason == ("lost frame" if k % every else "")
+        summary = {"frames": float(k // every + 1), "coverage": 0.97}
+        if said := method.enough(summary, k * turn_s / 50):
+            return method, said, k // every + 1
+    pytest.fail("it went on for ever")
+
+
+def test_lost_frames_are_named_where_coverage_ends() -> None:
+    method, said, _ = lossy(5)
+    assert re.search(r"5 turns covered no more, but \d+ of \d+ frames were lost", said)
+    assert "lower --frame-rate-hz" in said
     assert "does not reach" not in said
+    assert method.short()  # most were lost
+    assert not lossy(2)[0].short()
+    whole, said, _ = lossy(1)
+    assert "does not reach" in said
+    assert not whole.short()
+
+
+def test_turns_with_hardly_a_frame_do_not_tell_that_the_circle_reaches_no_more() -> None:
+    _, said, frames = lossy(40)
+    assert "5 turns covered no more" in said
+    assert frames > 100
+    method, said, frames = lossy(40, replace_spec(KNOWN, time_limit_s=60.0))
+    assert said.startswith("the time limit of 60 s: 97.0% of the lit pixels are covered, 99.5%")
+    assert frames < 100
+    assert method.short()
 
 
 def test_the_camera_as_it_is_set_bounds_the_feed() -> None:

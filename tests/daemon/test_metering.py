@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.separation.exposure import Limits
-from daemon.separation.metering import TARGET, Level, choose, level_of
+from daemon.separation.exposure import TARGET, Limits
+from daemon.separation.metering import Level, choose, level_of
 from daemon.separation.radiometry import Response
 
 MONO = Response(full_scale=4095, black=64.0)

@@ -45,13 +45,16 @@ def under(weather: str, seed: int) -> Outdoors:
 def apart(
     one: Outdoors, other: Outdoors, among: NDArray[np.bool_] | None = None
 ) -> NDArray[np.float64]:
-    """Differences of direct and global where the sun shines, parts of full scale: (2, n)."""
+    """Differences of direct and global where the sun shines, over the deviations that both state:
+    (2, n)."""
     a, b = one.components, other.components
     lit = one.truth["direct"] > 0.05 * FULL_SCALE
     if among is not None:
         lit &= among
     known = lit & np.isfinite(a.direct) & np.isfinite(b.direct)
-    return np.array([(b.direct - a.direct)[known], (b.global_ - a.global_)[known]]) / FULL_SCALE
+    stated = [np.hypot(a.planes[name], b.planes[name]) for name in ("direct_std", "global_std")]
+    different = b.direct - a.direct, b.global_ - a.global_
+    return np.array([(x / std)[known] for x, std in zip(different, stated, strict=True)])
 
 
 def rms(values: NDArray[np.float64]) -> float:
@@ -71,6 +74,8 @@ def test_drift_and_clouds_change_nothing_beyond_the_noise() -> None:
     assert steady.components.facts["penumbra_mm"] == pytest.approx(1.4, abs=0.2)
     assert steady.components.facts["leakage_at_most"] == 0.0
     noise, found = apart(steady, under("steady", 2)), apart(steady, cloudy)
+    for component in noise:
+        assert 0.8 < rms(component) < 1.25  # as stated
     assert rms(found[0]) < 1.2 * rms(noise[0])
     assert rms(found[1]) < 1.3 * rms(noise[1])
     bright = steady.truth["direct"] > 0.05 * FULL_SCALE

@@ -243,7 +243,7 @@ def test_common_white_ignores_nan_and_specks() -> None:
 
 def test_every_bit_is_explained_in_a_colour_of_its_own() -> None:
     assert {bit.flag for bit in BITS} == set(Quality)
-    assert len({bit.hex for bit in BITS}) == len(BITS)
+    assert len({bit.colour for bit in BITS}) == len(BITS)
 
 
 def test_a_lone_flag_still_shows_in_a_small_overlay() -> None:

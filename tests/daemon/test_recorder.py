@@ -6,6 +6,7 @@ import errno
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,13 +15,14 @@ import daemon.storage.journal
 from daemon.exposing.recorder import Exposed, Recorder
 from daemon.exposing.ring import Ring
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Bench
+from daemon.scans.method import Bench, Method
 from daemon.separation.estimator import NotYet
 from daemon.storage.durable import StorageError
 from daemon.storage.frames import FrameStore
 from drivers.base.camera import CameraInfo, Frame
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
+from protocol.errors import Code, UmbraError
 from protocol.scans.projected import TwoImage
 
 SHAPE = (12, 16)
@@ -65,9 +67,15 @@ class Course:
         pass
 
 
-def record(frames: FrameStore, course: Course) -> Recorder:
+def two_images() -> Method[Any]:
+    return method_for(TwoImage(), Bench(CAMERA, projector=ProjectorInfo(64, 48, 60.0)))
+
+
+def record(
+    frames: FrameStore, course: Course, method: Method[Any] | None = None, source: str = ""
+) -> Recorder:
     """Record a two-image scan of four frames, each of one grey; not finished yet."""
-    method = method_for(TwoImage(), Bench(CAMERA, projector=ProjectorInfo(64, 48, 60.0)))
+    method = method or two_images()
     ring = Ring(4, SHAPE, np.dtype(np.uint8))
     recorder = Recorder(method, frames, ring, course.on_taken, course.on_full)
     recorder.start()
@@ -77,7 +85,7 @@ def record(frames: FrameStore, course: Course) -> Recorder:
         buffer = ring.take(1.0)
         assert buffer is not None
         buffer[...] = 40 + 50 * index
-        frame = Frame(buffer, index, 0, 1000, 0, 1.0)
+        frame = Frame(buffer, index, 0, 1000, 0, 1.0, source=source)
         recorder.put(Exposed(step=step, index=index, sub=0, frame=frame, buffer=buffer))
     return recorder
 
@@ -138,9 +146,41 @@ def test_after_a_failed_fsync_nothing_is_repeated(
 def test_while_the_past_is_taken_in_there_is_no_result(tmp_path: Path) -> None:
     # The estimator is in use by the thread that replays.
     frames = store(tmp_path / "run")
-    method = method_for(TwoImage(), Bench(CAMERA, projector=ProjectorInfo(64, 48, 60.0)))
     ring = Ring(4, SHAPE, np.dtype(np.uint8))
-    recorder = Recorder(method, frames, ring, Course().on_taken, Course().on_full)
+    recorder = Recorder(two_images(), frames, ring, Course().on_taken, Course().on_full)
     with pytest.raises(NotYet, match="ask again"):
         recorder.result(1.0)
+    frames.close()
+
+
+@pytest.mark.parametrize(
+    ("source", "said", "code"),
+    [
+        ("shot7.png", r"shot7\.png cannot be separated \(error: .*take it out", Code.BAD_INPUT),
+        ("", r"camera: frame 0 cannot be separated .*`umbra snap`", Code.DEVICE_GARBLED),
+    ],
+)
+@pytest.mark.parametrize("where", ["observe", "estimator"])
+def test_a_frame_that_nobody_thought_of_is_named(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+    source: str,
+    said: str,
+    code: Code,
+) -> None:
+    def fail(*_: object) -> Any:
+        raise cv2.error("Sizes of input arguments do not match")
+
+    method = two_images()
+    if where == "observe":
+        monkeypatch.setattr(method, "observe", fail)
+    else:
+        estimator = method.estimator()
+        monkeypatch.setattr(estimator, "update", fail)
+        monkeypatch.setattr(method, "estimator", lambda: estimator)
+    frames = store(tmp_path / "run")
+    with pytest.raises(UmbraError, match=said) as caught:
+        record(frames, Course(), method, source).finish()
+    assert caught.value.code is code
     frames.close()

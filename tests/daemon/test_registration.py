@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Bench, Taken, Watch
+from daemon.scans.method import Bench, Taken
 from daemon.separation.estimator import Components, Observation
 from daemon.separation.radiometry import Response
 from daemon.separation.registration import (
@@ -27,6 +27,7 @@ from drivers.base.pixelformat import PixelFormat
 from drivers.base.stage import StageInfo
 from protocol.mesh import Mesh as Holes
 from protocol.scans.occluded import Mesh
+from tests.daemon.scanning import watched
 
 HEIGHT, WIDTH = 156, 208
 PITCH = 20.0
@@ -158,7 +159,7 @@ def test_a_wall_without_texture_tells_nothing_and_says_so() -> None:
         for frame in frames(there, texture=0.0):
             camera.learn(frame)
         assert not camera.tells  # what moves there is the mesh
-    assert not Registration(DEEP).suits((120, 160))
+    assert not Registration(DEEP).suits((48, 60))
     with pytest.raises(ValueError, match="no reference"):
         Registration(DEEP).of(frames(STILL[:1])[0])
 
@@ -186,17 +187,7 @@ def separated(shifts: Shifts, *, align: bool) -> tuple[Components, list[Observat
     camera = CameraInfo(WIDTH, HEIGHT, PixelFormat.MONO16)
     bench = Bench(camera, stage=StageInfo(((0, 500), (0, 300)), 100.0))
     spec = Mesh(hole_mm=HOLES.hole_mm, pitch_mm=HOLES.pitch_mm, align=align)
-    method = method_for(spec, bench)
-    step = method.step(0, {})
-    assert isinstance(step, Watch)
-    estimator, decided = method.estimator(), []
-    for k, frame in enumerate(frames(shifts)):
-        observation = method.observe(step, Taken(0, k, incomplete=False, pixels=frame))
-        estimator.update(frame, observation)
-        decided.append(observation)
-    found = estimator.result()
-    assert isinstance(found, Components)
-    return method.conclude(found), decided
+    return watched(spec, bench, frames(shifts))
 
 
 def test_a_gust_is_aligned_and_a_fall_is_left_out() -> None:

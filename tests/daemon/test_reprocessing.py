@@ -428,14 +428,14 @@ def test_an_abort_ends_it_between_two_frames(store: Store) -> None:
     waiting = lane.submit(asked(parent), "me", "")
     assert lane.abort(waiting, "me").file.state is RunState.ABORTED
     begun = lane.submit(asked(parent), "me", "")
-    found = lane._begin()
+    found = lane.begin()
     assert found is not None
     assert found.folder is begun
     end = found.execute()
     assert (end.state, end.by) == (RunState.ABORTED, "me")
     assert 0 < begun.file.recorded < 27
     assert begun.file.products == ()
-    assert lane.current is None
+    assert lane.under_way is None
     with pytest.raises(UmbraError, match="is aborted: it cannot be aborted"):
         lane.abort(begun, "me")
 
@@ -445,7 +445,7 @@ def test_a_result_and_progress_are_there_on_the_way(store: Store) -> None:
     seen: list[AnyEvent] = []
     lane = reprocessor(store, seen.append)
     lane.submit(asked(parent), "me", "")
-    found = lane._begin()
+    found = lane.begin()
     assert found is not None
     with pytest.raises(UmbraError) as caught:
         found.result()

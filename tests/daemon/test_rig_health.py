@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from daemon import config
 from daemon.devices.rig import Rig
 from drivers.base.errors import DeviceLost
+from drivers.virtual.faults import Fault
 from protocol.messages.rig import DeviceInfo, Health
 
 
@@ -29,5 +32,22 @@ def test_a_check_that_is_older_than_the_loss_says_nothing() -> None:
         assert [i.health for i in told if i.name == "camera"] == [
             Health.READY, Health.LOST, Health.READY,
         ]  # fmt: skip
+    finally:
+        rig.close()
+
+
+def test_another_device_in_the_place_of_the_first_is_not_taken_for_it() -> None:
+    rig = Rig(config.load(None), lambda _: None)
+    try:
+        rig.connect()
+        camera = rig.camera
+        camera.device.faults.inject(Fault.RENAME, act="check")  # type: ignore[attr-defined]
+        with pytest.raises(DeviceLost):
+            camera.call(lambda c: c.check(), 60.0)
+        connect = rig._connecting(rig._members["camera"])
+        with pytest.raises(DeviceLost):  # it is away for one attempt
+            camera.call(connect, 60.0)
+        with pytest.raises(DeviceLost, match="another device came back"):
+            camera.call(connect, 60.0)
     finally:
         rig.close()

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.envelope import block_mean
 from daemon.separation.estimator import Components, Lighting, Observation
 from daemon.separation.radiometry import Response
-from daemon.separation.single import PeaksAndValleys, block_mean
+from daemon.separation.single import PeaksAndValleys
 
 SHAPE = (96, 160)
 LEAK = 0.05

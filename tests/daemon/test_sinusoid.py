@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from daemon.scans import catalog
 from daemon.scans.method import Expose
+from daemon.separation.deviation import of_noise
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.frameset import UNCHECKED
 from daemon.separation.radiometry import Response
@@ -112,7 +113,7 @@ def test_noise_is_the_theorys_and_is_stated(count: int) -> None:
         assert errors.std() == pytest.approx(theory, rel=0.1)
         assert abs(errors.mean()) < 0.2 * sigma
         if count > 3:
-            stated = runs[0].planes[f"{name.rstrip('_')}_std"]
+            stated = of_noise(runs[0].planes, f"{name.rstrip('_')}_std")
             assert float(np.median(stated)) == pytest.approx(theory, rel=0.1)
 
 

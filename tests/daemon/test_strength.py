@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.scans.catalog import method_for
-from daemon.scans.method import Bench, Taken, Watch
+from daemon.scans.method import Bench, Taken
 from daemon.separation.estimator import Components, Observation
 from daemon.separation.radiometry import Response
 from daemon.separation.strength import SourceStrength
@@ -17,6 +17,7 @@ from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.stage import StageInfo
 from protocol.scans.occluded import Mesh
+from tests.daemon.scanning import watched
 from tests.daemon.test_mesh import COVERING, DEEP, HEIGHT, MESH, WIDTH, circle, counts, errors
 
 TURN = 72
@@ -55,17 +56,7 @@ def test_strength_is_the_sources_and_not_the_shadows() -> None:
 def observed(shots: list[NDArray[Any]]) -> tuple[Components, list[Observation]]:
     camera = CameraInfo(WIDTH, HEIGHT, PixelFormat.MONO16)
     bench = Bench(camera, stage=StageInfo(((0, 500), (0, 300)), 100.0))
-    method = method_for(Mesh(hole_mm=MESH.hole_mm, pitch_mm=MESH.pitch_mm, sun=True), bench)
-    step = method.step(0, {})
-    assert isinstance(step, Watch)
-    estimator, decided = method.estimator(), []
-    for k, frame in enumerate(shots):
-        observation = method.observe(step, Taken(0, k, incomplete=False, pixels=frame))
-        estimator.update(frame, observation)
-        decided.append(observation)
-    found = estimator.result()
-    assert isinstance(found, Components)
-    return method.conclude(found), decided
+    return watched(Mesh(hole_mm=MESH.hole_mm, pitch_mm=MESH.pitch_mm, sun=True), bench, shots)
 
 
 def test_a_cloud_is_kept_out_and_drift_is_scaled_so_that_the_separation_is_the_same() -> None:

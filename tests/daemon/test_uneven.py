@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from daemon import patterns
 from daemon.scans.method import Expose
 from daemon.separation.estimator import Lighting, Quality
+from daemon.separation.uneven import unevenness
 from protocol.scans.anyscan import AnySeparation
 from protocol.scans.projected import Checkerboard, RandomBinary
 from tests.daemon.scene import FULL, Scene
@@ -53,6 +54,21 @@ def test_what_scatters_over_less_than_a_patch_is_stated_and_told(spec: AnySepara
     assert np.mean(flagged[CLOUDY]) > 0.8
     assert np.mean(flagged[CLEAR]) < 0.01
     assert any("scattered or reflected over less" in line for line in found.facts["advice"])
+
+
+@pytest.mark.parametrize(("share", "flagged"), [(0.1, False), (0.5, True)])
+def test_a_faint_colour_has_no_say(share: float, flagged: bool) -> None:
+    """As of a camera whose correction of colours leaves mostly noise of a dim one."""
+    uneven = np.array([share, *2 * [(1 - share) / 2]], dtype=np.float32) * np.float32(1000)
+    high = np.broadcast_to(uneven, (3, 40, 60, 3)).copy()
+    low = high * np.float32(0.2)
+    high[1:, :, 30:, 0] *= np.float32(0.6)
+    known = np.full(high[0].shape, 0.5, dtype=np.float32)
+    found = unevenness(low, high, known, known, 25, shifted=True)
+    assert np.all((found.flags[:, 36:] != 0) == flagged)
+    assert not np.any(found.flags[:, :24])
+    assert np.all(found.off[:, 36:, 0] > 0.1 * uneven[0])
+    assert bool(found.advice) == flagged
 
 
 @pytest.mark.parametrize("sigma", [0.003, 0.02])

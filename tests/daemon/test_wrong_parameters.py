@@ -99,6 +99,19 @@ def test_a_checkerboard_is_no_sinusoid_and_the_reverse() -> None:
     assert _says(declared(Checkerboard(radiometry=LIGHT), waves), "not the shifts")
 
 
+@pytest.mark.parametrize(
+    "spec",
+    [
+        RandomBinary(patterns=8, radiometry=LIGHT),
+        RandomBinary(patterns=20, radiometry=LIGHT),
+        RandomBinary(patterns=20, estimator="maxmin", radiometry=LIGHT),
+    ],
+)
+def test_a_sinusoid_is_no_random_patches(spec: RandomBinary) -> None:
+    waves = _taken(Sinusoid(phases=spec.patterns, references=(), radiometry=LIGHT))
+    assert _says(declared(spec, waves), "no patterns of lit and unlit")
+
+
 def test_shifts_in_another_order_are_told() -> None:
     checkers = _taken(Checkerboard(references=(), radiometry=LIGHT))
     order = np.random.default_rng(2).permutation(25)

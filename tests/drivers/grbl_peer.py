@@ -445,8 +445,8 @@ class GrblPeer:
             self._say("error:8")
             return
         self.state = "Home"
-        end = time.monotonic() + self.faults.homing_s / self.speed
-        while time.monotonic() < end:
+        began = time.monotonic()
+        while time.monotonic() < began + self.faults.homing_s / self.speed:  # it may be changed
             yield
         if self.faults.switch_missing:
             self._say("ALARM:9")

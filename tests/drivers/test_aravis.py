@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -247,7 +248,8 @@ def test_lost_packets_are_told(bench: Bench) -> None:
     assert cam.facts()["incomplete"] == broken
     sequence = [f.sequence for f in frames]
     assert sequence == sorted(set(sequence))
-    assert sequence[-1] < 80
+    steps = [after - before for before, after in pairwise(sequence)]
+    assert steps.count(1) > 40  # a busy machine loses many at once, and not one now and then
 
 
 def test_a_camera_that_dies_is_lost_and_comes_back(bench: Bench) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import struct
 import tracemalloc
 from pathlib import Path
@@ -15,8 +16,9 @@ from drivers.base.camera import Acquisition, CameraSettings, Frame
 from drivers.base.device import Context
 from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, EndOfRecording
 from drivers.base.pixelformat import PixelFormat
+from drivers.recording import natural_key
 from drivers.registry import build
-from drivers.replay import ReplayCamera, ReplayOptions, natural_key
+from drivers.replay import ReplayCamera, ReplayOptions
 
 FREE = Acquisition.FREE
 
@@ -357,6 +359,13 @@ def test_files_that_are_no_images(tmp_path: Path) -> None:
     notes.unlink()
     notes.symlink_to(tmp_path / "gone")
     assert "notes.txt cannot be read (No such file or directory)" in refusal(tmp_path)
+    notes.unlink()
+    notes.symlink_to(notes)
+    assert "notes.txt cannot be read (Too many levels of symbolic links)" in refusal(tmp_path)
+    notes.unlink()
+    os.mkfifo(notes)  # nobody ever writes to it
+    assert "notes.txt is no file" in refusal(tmp_path)
+    assert "notes.txt is no file" in refusal(notes)
 
 
 def test_a_first_file_that_is_missing(tmp_path: Path) -> None:
@@ -377,6 +386,52 @@ def test_float_tiff_is_refused(tmp_path: Path) -> None:
 def test_a_tiff_of_many_pages_is_refused(tmp_path: Path) -> None:
     assert cv2.imwritemulti(str(tmp_path / "a.tiff"), [picture(0), picture(1)])
     assert "a.tiff holds 2 pages" in refusal(tmp_path)
+
+
+def directory(**tags: int) -> bytes:
+    """A TIFF's directory of 32-bit tags, of a 4 x 2 grey picture unless they say otherwise."""
+    own = {"t256": 4, "t257": 2, "t258": 8, "t259": 1, "t262": 1, "t273": 16, "t277": 1, "t279": 8}
+    entries = sorted((int(name[1:]), value) for name, value in (own | tags).items())
+    packed = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in entries)
+    return struct.pack("<H", len(entries)) + packed + struct.pack("<I", 0)
+
+
+def small_tiff(mark: bytes = bytes(8), below: dict[str, int] | None = None, **tags: int) -> bytes:
+    """4 x 2 grey pixels; with further tags, and a page `below` this one."""
+    samples = bytes(range(8))
+    if below is None:
+        return b"II*\0" + struct.pack("<I", 24) + mark + samples + directory(**tags)
+    under = directory(**below)
+    at = 24 + len(under)
+    page = directory(**tags, t330=24)
+    return b"II*\0" + struct.pack("<I", at) + mark + samples + under + page
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("DSC_0001.NEF", small_tiff()),  # by its name
+        ("a.cr3", b"\0\0\0\x18ftypcrx "),
+        ("a.tif", small_tiff(below={"t262": 32803})),  # a picture for viewing over a mosaic
+        ("a.tif", small_tiff(t50706=0x0401)),  # DNGVersion
+        ("a.tif", small_tiff(t262=34892)),  # linear DNG
+        ("a.tif", small_tiff(b"CR\x02\0" + bytes(4))),  # CR2
+    ],
+)
+def test_a_cameras_raw_file_is_refused_and_how_to_convert_it_said(
+    tmp_path: Path, name: str, data: bytes
+) -> None:
+    (tmp_path / name).write_bytes(data)
+    said = refusal(tmp_path)
+    assert f"{name} is a camera's raw file" in said
+    assert "dcraw -D -4 -T -t 0" in said
+    assert "`bayer`" in said
+
+
+def test_a_tiff_with_a_smaller_picture_below_is_no_raw_file(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").write_bytes(small_tiff(below={"t254": 1}))
+    (frame,) = grab_all(connected(tmp_path))
+    np.testing.assert_array_equal(frame.pixels, np.arange(8, dtype=np.uint8).reshape(2, 4))
 
 
 def test_options_that_contradict_the_files(tmp_path: Path) -> None:

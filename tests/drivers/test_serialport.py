@@ -27,8 +27,6 @@ from drivers.grbl import GrblStage
 from drivers.serialport import LONGEST_LINE, LineReader, SerialPort
 from drivers.tmcl import TmclStage
 
-pytestmark = pytest.mark.timeout(10)
-
 
 class Pty:
     def __init__(self) -> None:
@@ -252,13 +250,27 @@ def while_open(port: SerialPort) -> None:
         port.read()
 
 
+class Asked(RealClock):
+    """A clock that tells when somebody asked it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked = threading.Event()
+
+    def now_ns(self) -> int:
+        now = super().now_ns()
+        self.asked.set()
+        return now
+
+
 def test_lines_carry_the_time_of_their_first_byte(ptys: list[Pty]) -> None:
-    port, clock, arrived = SerialPort("stage", ptys[0].path, 115200), RealClock(), threading.Event()
+    port, clock, arrived = SerialPort("stage", ptys[0].path, 115200), Asked(), threading.Event()
     port.open()
     reader = LineReader(port, clock, arrived)
     before = clock.now_ns()
+    clock.asked.clear()
     os.write(ptys[0].master, b"<Id")
-    time.sleep(0.05)
+    assert clock.asked.wait(60)  # the reader has it
     between = clock.now_ns()
     os.write(ptys[0].master, b"le>\r\n\xff\xfe\r\nok\n" + b"x" * (LONGEST_LINE + 10))
     lines: list[tuple[int, str]] = []

@@ -203,15 +203,18 @@ def test_wax_is_mostly_global_and_water_glows() -> None:
     assert water.cut(truth["global"])[60:100, 20:60].mean() > 3 * wall
 
 
-def test_a_strong_lamp_has_as_strong_a_truth() -> None:
-    rig = Rig(SMALL_P, SMALL_C | {"exposure_us": 4000.0})
-    lamp = cast(VirtualLight, build("light", "virtual", "left", {"strength": 3.0}, rig.context))
+def lamplight(rig: Rig, **options: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """What the left lamp adds to a picture, and what its truth says, direct and global together."""
+    lamp = cast(VirtualLight, build("light", "virtual", "left", options, rig.context))
     lamp.connect()
     off = rig.linear(None)
     lamp.set(True)
-    on = rig.linear(None) - off
     truth = rig.camera.truth(("left",))
-    whole = truth["direct"] + truth["global"]
+    return rig.linear(None) - off, truth["direct"] + truth["global"]
+
+
+def test_a_strong_lamp_has_as_strong_a_truth() -> None:
+    on, whole = lamplight(Rig(SMALL_P, SMALL_C | {"exposure_us": 4000.0}), strength=3.0)
     dim = whole < 60000
     assert np.mean(dim) > 0.9
     np.testing.assert_allclose(on[dim], whole[dim], atol=3)
@@ -230,13 +233,7 @@ def test_the_truth_is_that_of_the_light_under_the_occluder() -> None:
 
 def test_each_lamp_has_a_truth_of_its_own() -> None:
     rig = Rig(SMALL_P, SMALL_C)
-    lamp = cast(VirtualLight, build("light", "virtual", "left", {}, rig.context))
-    lamp.connect()
-    off = rig.linear(None)
-    lamp.set(True)
-    on = rig.linear(None) - off
-    truth = rig.camera.truth(("left",))
-    whole = truth["direct"] + truth["global"]
+    on, whole = lamplight(rig)
     dim = whole < 60000
     np.testing.assert_allclose(on[dim], whole[dim], atol=3)
     assert np.abs(whole - sum(rig.camera.truth().values())).max() > 5000

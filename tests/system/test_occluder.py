@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -30,7 +31,7 @@ homing_feed_mm_s = 200
 name = "left"
 driver = "virtual"
 """
-CAMERA = 'pixel_format = "Mono12"\nframe_rate_hz = 25\n'
+CAMERA = 'pixel_format = "Mono12"\nframe_rate_hz = 25\nbuffers = 64\n'
 MESH = umbra.Mesh(hole_mm=12.5, pitch_mm=20.0, source_deg=0.1, scene_mm=150.0, coverage=0.97)
 ENDLESS = umbra.Mesh(hole_mm=12.5, pitch_mm=20.0, coverage=1.0, time_limit_s=600.0)
 
@@ -73,14 +74,23 @@ def test_a_mesh_scan_homes_circles_and_ends_when_it_has_covered(bench: Daemon) -
 
 
 def test_the_time_limit_ends_it_and_says_so(bench: Daemon) -> None:
+    limited = msgspec.structs.replace(ENDLESS, time_limit_s=2.0)
     with bench.start() as rig:
-        run = rig.scan(umbra.Mesh(hole_mm=12.5, pitch_mm=20.0, coverage=1.0, time_limit_s=1.0))
+        run = rig.scan(limited)
         info = run.wait(60)
         assert info.state is RunState.DONE
         assert info.end is not None
-        assert info.end.reason.startswith("the time limit of 1 s, at ")
+        assert info.end.reason.startswith("the time limit of 2 s: ")
         progress_file = json.loads((bench.data / "runs" / run.id / "quality.json").read_text())
         assert 0 < progress_file["coverage"] < 1
+        run = rig.scan(msgspec.structs.replace(limited, time_limit_s=1e-6))
+        info = run.wait(60, check=False)
+        assert info.state is RunState.FAILED
+        assert info.end is not None
+        assert info.end.code == "no_result"
+        assert "needs 2 frames, 0 came so far. It ended for: the time limit" in info.end.reason
+        rig.resume(run.id)  # it goes on from there, for as short a time
+        assert run.wait(60, check=False).state is RunState.FAILED
 
 
 def test_abort_and_pause_hold_the_stage(bench: Daemon) -> None:

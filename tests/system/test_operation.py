@@ -35,7 +35,7 @@ def test_a_scan_from_command_to_components(daemon: Daemon) -> None:
 def test_a_second_client_while_a_scan_runs(daemon: Daemon) -> None:
     daemon.configure(scale=1)
     with daemon.start() as rig, daemon.connect() as other:
-        run = rig.scan(umbra.Checkerboard(average=10))
+        run = rig.scan(umbra.Checkerboard(shift=2, shifts=8, average=10))  # 20 s
         recorded(other, run.id, 42)  # black, white and two patterns
         status = other.status()
         assert status.state is RigState.SCANNING
@@ -246,8 +246,8 @@ def test_a_bad_configuration_exits_with_2(daemon: Daemon) -> None:
 
 
 def test_an_emergency_stop_before_the_run_has_the_devices(daemon: Daemon) -> None:
-    # Manual work whose safe state takes its time: the run is chosen, but not yet in its session.
-    daemon.configure(projector='faults = ["timeout:safe@2"]')
+    # Manual work whose safe state waits to be halted: the run is chosen, but has no session yet.
+    daemon.configure(projector='faults = ["stall:safe@2"]')
     with daemon.start() as rig, daemon.connect() as other:
         rig.show(umbra.WHITE)
         run = rig.scan(ENDLESS)

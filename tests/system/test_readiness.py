@@ -14,7 +14,7 @@ import pytest
 
 import umbra
 from daemon.storage.frames import FrameStore
-from protocol.errors import UmbraError
+from protocol.errors import Code, UmbraError
 from protocol.messages.replies import Status
 from protocol.messages.rig import RigState, StageState
 from protocol.messages.runs import RunState
@@ -180,6 +180,35 @@ def test_a_device_that_is_away_is_waited_for(daemon: Daemon) -> None:
         assert [what for what, _ in waited] == ["light", "devices"]
         assert "camera: grab" in waited[0][1]
         assert "camera (virtual) is lost" in waited[1][1]
+
+
+def test_a_device_that_fails_later_is_waited_for_too(daemon: Daemon) -> None:
+    daemon.configure(camera='faults = ["vanish@12*2", "vanish@20"]')
+    with daemon.start() as rig:
+        run = rig.scan(umbra.Checkerboard(ready=Ready(deadline_s=1e5, look_s=600.0)))
+        info = run.wait(60)
+        assert (info.state, info.recorded, info.missing) == (RunState.DONE, 27, 0)
+        told = [record["event"] for record in rig.log(run.id)]
+        assert told.count("a device failed") == told.count("resumed") == 2
+        records = FrameStore.open(daemon.data / "runs" / run.id, readonly=True).records()
+        assert [(r.step, r.sub) for r in records] == [(step, 0) for step in range(27)]
+
+
+@pytest.mark.parametrize(
+    ("faults", "code"),
+    [
+        ('["vanish@12*100000"]', Code.NOT_READY),  # it stays away
+        ('["vanish@12", "vanish@13", "vanish@14"]', Code.DEVICE_LOST),  # there, but of no use
+    ],
+)
+def test_not_for_ever(daemon: Daemon, faults: str, code: Code) -> None:
+    daemon.configure(camera=f"faults = {faults}")
+    with daemon.start() as rig:
+        deadline_s = 30.0 if code is Code.NOT_READY else 1e5
+        run = rig.scan(umbra.Checkerboard(ready=Ready(deadline_s=deadline_s, look_s=600.0)))
+        info = run.wait(60, check=False)
+        assert info.end is not None
+        assert (info.state, info.end.code, info.recorded) == (RunState.FAILED, code, 11)
 
 
 def test_a_scan_may_be_queued_while_a_device_is_away(daemon: Daemon) -> None:

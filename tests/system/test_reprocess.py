@@ -139,6 +139,7 @@ def test_beside_the_queue_through_a_kill_and_an_emergency_stop(daemon: Daemon) -
         assert any(0 < now.recorded < 162 for now in news)
         made += [rig.reprocess(parent) for n in range(3)]
         made[4].abort()
+        made += [rig.reprocess(parent) for _ in range(12)]  # enough to be killed in the middle of
         assert rig.run(scans[0]).refresh().state is RunState.RUNNING
         assert rig.run(scans[1]).refresh().state is RunState.QUEUED
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import umbra
+from protocol.client import EventStream
 from protocol.errors import Code, UmbraError
 from protocol.messages.events import StageChanged
 from protocol.messages.rig import RigState, StageState
@@ -32,6 +33,16 @@ def at(rig: umbra.Client, state: StageState) -> bool:
     return rig.stage().state is state
 
 
+def told(events: EventStream, state: StageState) -> None:
+    """Wait until it is published that the stage is in a state."""
+    while True:
+        notice = events.next(60.0)
+        assert notice is not None
+        assert isinstance(notice.body, StageChanged)
+        if notice.body.state is state:
+            return
+
+
 def homed(rig: umbra.Client) -> None:
     rig.stage_home(30.0)
     until(lambda: at(rig, StageState.IDLE))
@@ -42,27 +53,21 @@ def test_homed_moved_and_followed_to_the_end(staged: Daemon) -> None:
         assert rig.stage().state is StageState.UNKNOWN
         with pytest.raises(UmbraError, match="home it") as caught:
             rig.stage_move(10, 10, 50)
-        assert caught.value.code is Code.DEVICE_REFUSED
+        assert caught.value.code is Code.WRONG_STATE
         begun = rig.stage_home(30.0)
         assert (begun.state, begun.position_mm) == (StageState.HOMING, None)
-        with pytest.raises(UmbraError, match="homing"):
-            rig.stage_home(30.0)
-        until(lambda: at(rig, StageState.IDLE))
+        told(events, StageState.HOMING)
+        told(events, StageState.IDLE)
         assert rig.stage().position_mm == pytest.approx((0, 0))
-        moving = rig.stage_move(40, 30, 5)  # 1 s
+        moving = rig.stage_move(400, 200, 1)  # 56 s
         assert moving.state is StageState.MOVING
         assert rig.status().state is RigState.MANUAL
-        until(lambda: at(rig, StageState.IDLE))
+        told(events, StageState.MOVING)
+        rig.stage_move(40, 30, 100)
+        told(events, StageState.IDLE)
         assert rig.stage().position_mm == pytest.approx((40, 30))
         with pytest.raises(UmbraError, match="past the soft limit"):
             rig.stage_move(-1, 0, 20)
-        seen: list[StageState] = []
-        while not seen or seen[-1] != StageState.IDLE or StageState.MOVING not in seen:
-            notice = events.next(60.0)
-            assert notice is not None
-            assert isinstance(notice.body, StageChanged)
-            seen.append(notice.body.state)
-        assert StageState.HOMING in seen
         until(lambda: rig.status().state is RigState.IDLE)  # manual work ends with the motion
         assert rig.stage().position_mm == pytest.approx((40, 30))
 
@@ -80,9 +85,13 @@ def test_an_endless_circle_goes_on_until_it_is_stopped(staged: Daemon) -> None:
 
 
 def test_homing_is_stopped_and_its_failure_told(staged: Daemon) -> None:
-    staged.configure(more=STAGE.format('faults = ["no-switch@2"]'), scale=2)
+    slowly = 'faults = ["no-switch@2"]\nhoming_feed_mm_s = 0.01'
+    staged.configure(more=STAGE.format(slowly), scale=2)
     with staged.start() as rig:
-        rig.stage_home(30.0)
+        rig.stage_home(600.0)
+        with pytest.raises(UmbraError, match="homing") as caught:
+            rig.stage_home(30.0)
+        assert caught.value.code is Code.BUSY
         stopped = rig.stage_stop()
         assert stopped.state is StageState.UNKNOWN
         assert "halted" in stopped.detail
@@ -122,7 +131,7 @@ def test_a_scan_waits_for_the_end_of_a_motion(staged: Daemon) -> None:
 def test_an_emergency_stop_ends_it(staged: Daemon) -> None:
     with staged.start() as rig:
         homed(rig)
-        rig.stage_move(400, 200, 20)
+        rig.stage_move(400, 200, 1)  # 56 s
         rig.estop()
         until(lambda: not at(rig, StageState.MOVING))
         position = rig.stage().position_mm
@@ -137,10 +146,11 @@ def test_a_real_controller(daemon: Daemon, tmp_path: Path) -> None:
     """The same over Grbl's own protocol: homing is silent, an arc is many lines."""
     with GrblPeer(tmp_path, speed=4.0, resets_on_open=False) as peer:
         daemon.configure(scale=1, more=f'[stage]\ndriver = "grbl"\nport = "{peer.link}"')
-        peer.faults.homing_s = 8.0  # of the peer's clock: 2 s
+        peer.faults.homing_s = 1e6
         with daemon.start() as rig:
-            begun = rig.stage_home(20.0)
+            begun = rig.stage_home(100.0)
             assert rig.stage().state is begun.state is StageState.HOMING
+            peer.faults.homing_s = 0.0
             until(lambda: at(rig, StageState.IDLE))
             rig.stage_move(-10, -10, 20)
             until(lambda: at(rig, StageState.IDLE))
@@ -154,7 +164,7 @@ def test_a_real_controller(daemon: Daemon, tmp_path: Path) -> None:
             until(lambda: at(rig, StageState.IDLE))
             assert rig.stage().position_mm == pytest.approx((-14, -10), abs=0.01)
             peer.faults.switch_missing = True
-            rig.stage_home(20.0)
+            rig.stage_home(100.0)
             until(lambda: at(rig, StageState.ALARM))
             assert "switch" in rig.stage().detail
             assert rig.stage_unlock().state is StageState.UNKNOWN
@@ -178,6 +188,9 @@ def test_the_command_line(staged: Daemon) -> None:
 
     with staged.start():
         assert "unknown" in umbra_stage().stdout
+        unhomed = umbra_stage("move", "12.5", "40")
+        assert unhomed.returncode == 4
+        assert "umbra stage home" in unhomed.stderr
         assert umbra_stage("home", "--wait").returncode == 0
         done = umbra_stage("move", "12.5", "40", "--wait", "--json")
         assert json.loads(done.stdout)["position_mm"] == pytest.approx([12.5, 40])

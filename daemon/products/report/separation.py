@@ -175,7 +175,7 @@ def _viewer(subject: Subject) -> str:
 def _key(facts: Mapping[str, Any]) -> str:
     """The colours in the overlay, the most frequent first."""
     return "".join(
-        f'<span class="key"><i style="background:{bit.hex}"></i>{_name(bit)}</span>'
+        f'<span class="key"><i style="background:{bit.colour}"></i>{_name(bit)}</span>'
         for bit in _seen(facts)
     )
 
@@ -183,7 +183,7 @@ def _key(facts: Mapping[str, Any]) -> str:
 def _legend(facts: Mapping[str, Any]) -> str:
     seen = _seen(facts)
     rows = "".join(
-        f'<li><i style="background:{bit.hex}"></i><div><b>{_name(bit)}</b>'
+        f'<li><i style="background:{bit.colour}"></i><div><b>{_name(bit)}</b>'
         f"<em>{percent(_share(facts, bit.name))}</em><p>{escape(bit.meaning)}</p>"
         f'<p class="do">{escape(bit.remedy)}</p></div></li>'
         for bit in seen
