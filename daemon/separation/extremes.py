@@ -258,9 +258,13 @@ class Extremes:
         )
 
     def _variances(self, found: Estimated, told: Told) -> tuple[Plane, Plane]:
-        """Of direct and of global light: of noise, that of the references included."""
+        """Of direct and of global light: of noise, that of the references included, and of the
+        rounding of counts that all samples share."""
         g = light_model.global_weight(self._alpha, self._leakage)
         direct, indirect = found.variances(self._leakage, g)
+        dark = told.rounding(found.unlit)
+        direct += (dark + told.rounding(found.lit)) * np.float32((1.0 - self._leakage) ** -2)
+        indirect += dark * np.float32(g**-2)
         reference = self._references.ambient_variance(told)
         if reference is not None:
             indirect += reference * np.float32(g**-2)

@@ -15,7 +15,7 @@ from daemon.separation.compression import COMPRESSED, in_blocks
 from daemon.separation.estimator import Components, Quality
 from daemon.separation.noise import Noise
 from daemon.separation.radiometry import Response
-from daemon.separation.scan_noise import PICTURE, RESIDUALS, ScanNoise
+from daemon.separation.scan_noise import PICTURE, RESIDUALS, ScanNoise, Told
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from protocol.scans.projected import Checkerboard
@@ -95,3 +95,16 @@ def _scanned(spec: Checkerboard, scene: Scene) -> Components:
     found = estimator.result()
     assert isinstance(found, Components)
     return found
+
+
+@pytest.mark.parametrize(("sigma", "left"), [(0.0, 1.0), (0.2, 0.21), (1.0, 0.0)])
+def test_rounding_that_noise_does_not_dither_stays_in_the_mean(sigma: float, left: float) -> None:
+    """Of many samples at levels all between two counts."""
+    deviation = float(np.hypot(sigma, 12.0**-0.5))
+    told = Told(Response(255), Noise((0.0, 255.0), (deviation, deviation)), 1, RESIDUALS)
+    level = np.linspace(10.0, 11.0, 50, endpoint=False)
+    noise = np.random.default_rng(1).normal(0, sigma, (4000, 1))
+    off = np.rint(level + noise).mean(axis=0) - level
+    found = float(told.rounding(np.array([10.0], np.float32))[0])
+    assert found * 12.0 == pytest.approx(left, abs=0.01)
+    assert found == pytest.approx(float(np.var(off)), abs=0.01)
