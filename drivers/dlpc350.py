@@ -210,7 +210,7 @@ class Dlpc350Projector(Projector):
             dmd.ROWS,
             self._refresh_hz,
             latency,
-            SequenceLimits(most, 1, (float(p.SHORTEST_US[1]), longest), float(p.DARK_US), total),
+            SequenceLimits(most, 1, (float(p.SHORTEST_US[1]), longest), total),
         )
 
     @property

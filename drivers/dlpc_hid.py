@@ -91,7 +91,6 @@ class DlpcHid:
         self._usb: Any = None
         self._in: Any = None
         self._out: Any = None
-        self._interface = 0
         self._sequence = 0
 
     # ------------------------------------------------------------ life
@@ -165,7 +164,7 @@ class DlpcHid:
             if device.is_kernel_driver_active(number):
                 device.detach_kernel_driver(number)
         usb.util.claim_interface(device, number)
-        self._usb, self._interface = device, number
+        self._usb = device
         self._in, self._out = ends[usb.util.ENDPOINT_IN], ends[usb.util.ENDPOINT_OUT]
 
     def close(self) -> None:

@@ -9,15 +9,21 @@ camera is stopped, and its exposure is as it was before.
 
 from __future__ import annotations
 
+import math
+
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.exposer import Exposer
 from daemon.exposing.modes import Choice, Mode
+from daemon.exposing.ring import Ring
 from daemon.exposing.sequences import Sequences
 from daemon.exposing.stepped import Stepped
 from daemon.exposing.streamed import Streamed
 from daemon.exposing.video import Video
-from daemon.scans.method import Digest, Expose, Watch
+from daemon.scans.method import Bench, Digest, Expose, Watch
 from drivers.base.errors import DeviceError
+
+_SEQUENCE_BYTES = 256 << 20
+"""Memory for the frames of hardware-timed sequences, where fewer are asked for."""
 
 
 def exposer_for(choice: Choice, apparatus: Apparatus) -> Exposer:
@@ -33,6 +39,18 @@ def exposer_for(choice: Choice, apparatus: Apparatus) -> Exposer:
     elif "none" in triggers:
         single = Streamed(apparatus)
     return Sequences(apparatus, single, strict=choice.strict)
+
+
+def ring_for(choice: Choice, bench: Bench, planned: int | None, least: int) -> Ring:
+    """The ring of a run that exposes in this way, of `least` frames or more: of a sequence all
+    frames are kept until it is known to be in step, while the one before is being recorded."""
+    info, limits = bench.camera, bench.projector.sequence if bench.projector else None
+    count = least
+    if choice.mode is Mode.HARDWARE and limits is not None:
+        frame_bytes = math.prod(info.shape) * info.pixel_format.dtype.itemsize
+        wanted = 2 * min(limits.images, planned or limits.images)
+        count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
+    return Ring(count, info.shape, info.pixel_format.dtype)
 
 
 class Sequencer:

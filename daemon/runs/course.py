@@ -17,7 +17,6 @@ frame ends the run.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -32,10 +31,10 @@ from daemon.exposing.ahead import frames_ahead
 from daemon.exposing.apparatus import Apparatus
 from daemon.exposing.control import Control
 from daemon.exposing.exposer import Behind
-from daemon.exposing.modes import Choice, Mode, choose
+from daemon.exposing.modes import Choice, choose
 from daemon.exposing.recorder import Exposed, Recorder
 from daemon.exposing.ring import Ring
-from daemon.exposing.sequencer import Sequencer, exposer_for
+from daemon.exposing.sequencer import Sequencer, exposer_for, ring_for
 from daemon.pictures.viewfinder import Viewfinder
 from daemon.products import separated
 from daemon.runs.ending import close, end_of, requeue, utc_now, with_exposure, without_result
@@ -64,8 +63,6 @@ _RESULT_S = 30.0
 """Deadline of the estimator's result."""
 _TRUTH_S = 60.0
 """Deadline of a simulated camera's truth, which it computes when it is asked."""
-_SEQUENCE_BYTES = 256 << 20
-"""Memory for the frames of hardware-timed sequences, where `ring_frames` are fewer."""
 
 _MENDS = {Code.DEVICE_LOST, Code.DEVICE_TIMEOUT, Code.DEVICE_GARBLED}
 _IN_VAIN = 3
@@ -209,13 +206,21 @@ class Course:
             rig=rig,
             bench=bench.recorded(),
             calibration=prepared.calibration,
+            estimates=prepared.estimates,
             sequencing=choice.facts(file.sequencing["counts"] if file.sequencing else {}),
         )
         if prepared.waited_s:
             self._timings["waited_s"] = self._timings.get("waited_s", 0.0) + prepared.waited_s
-        frames = self._frames(info, resuming)
+        frames = FrameStore.begin(
+            self.folder.path,
+            info.shape,
+            info.pixel_format.dtype,
+            pixels=self._config.storage.keep_frames,
+            resuming=resuming,
+        )
         try:
-            ring = self._ring(choice, bench, method.planned())
+            least = self._config.sequencer.ring_frames
+            ring = ring_for(choice, bench, method.planned(), least)
             recorder = self._recorder = self.standing.counts = Recorder(
                 method, frames, ring, self._taken, self._disk_full
             )
@@ -293,27 +298,6 @@ class Course:
         for warning in choice.warnings:
             log.warning("exposure", problem=warning)
         return choice
-
-    def _ring(self, choice: Choice, bench: Bench, planned: int | None) -> Ring:
-        """The ring: of a sequence all frames are kept until it is known to be in step, and the one
-        before is being recorded meanwhile."""
-        info, limits = bench.camera, bench.projector.sequence if bench.projector else None
-        count = self._config.sequencer.ring_frames
-        if choice.mode is Mode.HARDWARE and limits is not None:
-            frame_bytes = math.prod(info.shape) * info.pixel_format.dtype.itemsize
-            wanted = 2 * min(limits.images, planned or limits.images)
-            count = max(count, min(wanted, _SEQUENCE_BYTES // frame_bytes))
-        return Ring(count, info.shape, info.pixel_format.dtype)
-
-    def _frames(self, info: CameraInfo, resuming: bool) -> FrameStore:
-        if resuming and (self.folder.path / "frames.jsonl").exists():
-            return FrameStore.open(self.folder.path)
-        return FrameStore.create(
-            self.folder.path,
-            info.shape,
-            info.pixel_format.dtype,
-            pixels=self._config.storage.keep_frames,
-        )
 
     def _replayed(self, session: Session) -> None:
         """A frame of before has been taken in: a sign of life, and the place to be aborted."""

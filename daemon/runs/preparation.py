@@ -46,13 +46,15 @@ log = structlog.get_logger(__name__)
 @dataclass(frozen=True, slots=True)
 class Prepared:
     """What a run begins with. `settings` are the camera's in force, JSON-able, as run.json keeps
-    them; `exposure` where it was chosen by pictures."""
+    them; `exposure` where it was chosen by pictures; `estimates` of frames and bytes, where
+    the plan knows."""
 
     method: Method[Any]
     bench: Bench
     settings: dict[str, Any]
     calibration: dict[str, Any]
     exposure: Exposure | None
+    estimates: dict[str, float]
     waited_s: float
 
 
@@ -94,6 +96,7 @@ class Preparation:
         wanted = self._wanted(before)
         metered = spec.auto_exposure and not (before or {}).get("settings")
         exposure: Exposure | None = None
+        estimates: dict[str, float] = {}
 
         def devices() -> None:
             self._rig.require_ready()
@@ -103,7 +106,8 @@ class Preparation:
             self._settings = self._configure(session, wanted)
 
         def disk() -> None:
-            self._room(method_for(spec, self._rig.bench()).planned())
+            nonlocal estimates
+            estimates = self._room(method_for(spec, self._rig.bench()).planned())
 
         def stage() -> None:
             if isinstance(spec, OccluderScan) and self._rig.stage is not None:
@@ -143,6 +147,7 @@ class Preparation:
             settings=self._settings,
             calibration=calibration,
             exposure=exposure,
+            estimates=estimates,
             waited_s=waited_s,
         )
 
@@ -185,7 +190,9 @@ class Preparation:
             "pixel_format": camera.device.info().pixel_format.value,
         }
 
-    def _room(self, planned: int | None) -> None:
+    def _room(self, planned: int | None) -> dict[str, float]:
+        """What the run is expected to take. Raises UmbraError(storage_full) where there is no room
+        for it."""
         info = self._rig.camera.device.info()
         need = estimate_bytes(
             info.shape, info.pixel_format.dtype, planned or 1, self._config.storage.keep_frames
@@ -196,6 +203,7 @@ class Preparation:
                 f"{self._config.rig.data}: the scan needs about {need / 1e6:.0f} MB beyond the "
                 f"reserve, {self._store.free_bytes() / 1e6:.0f} MB are free: delete old runs",
             )
+        return {} if planned is None else {"frames": float(planned), "bytes": float(need)}
 
     # ------------------------------------------------------------ the light
 

@@ -29,8 +29,12 @@ from protocol.errors import Code, UmbraError
 from protocol.messages.events import AnyEvent, Progressed, QueueChanged, RunChanged
 from protocol.messages.runs import End, RunState
 from protocol.scans.anyscan import AnyScan
+from protocol.scans.occluded import OccluderScan
 
 _UNFINISHED = {RunState.RUNNING, RunState.PAUSED, RunState.FINISHING}
+
+_TOO_FEW = {Code.FRAMES_MISSING, Code.NO_RESULT}
+"""What a video fails with that goes on where it ended, if it is resumed."""
 
 LOCK = "lock"
 """A reason to hold the queue, except for runs of whoever holds the rig."""
@@ -336,6 +340,13 @@ class Runner(RunLoop[Course]):
                 raise wrong_state(self._store.open(run), "paused")
             raise UmbraError(Code.WRONG_STATE, "no run is under way")
         return course
+
+    def _require_resumable(self, run: RunFolder) -> None:
+        """Raise UmbraError(wrong_state) unless there is something left to be done in it."""
+        file = run.file
+        ended = file.end.code if file.end and file.state is RunState.FAILED else ""
+        if not (isinstance(file.spec, OccluderScan) and ended in _TOO_FEW):
+            super()._require_resumable(run)
 
     def _queue_changed(self, run: RunFolder) -> None:
         self._publish(RunChanged(run=run.info()))

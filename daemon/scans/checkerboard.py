@@ -28,6 +28,11 @@ class CheckerboardMethod(RankedMethod[Checkerboard]):
         super().__init__(spec, bench, shifted)
 
     @property
+    def balanced(self) -> bool:
+        """See `PatternMethod`."""
+        return False
+
+    @property
     def even(self) -> bool:
         """See `PatternMethod`."""
         return self.spec.checker <= FINE_PX

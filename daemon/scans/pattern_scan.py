@@ -17,6 +17,7 @@ from daemon.scans.method import INCOMPLETE, Bench, Expose, Step, Taken, Unsuitab
 from daemon.scans.parameters import exposure_of, leakage_of, noise_of, response_of
 from daemon.scans.planned import PlannedMethod, exposures, references
 from daemon.separation.bracket import Bracketed
+from daemon.separation.creep import Creep
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation, Quality
 from daemon.separation.exposure_noise import ROUNDING, Sensor
 from daemon.separation.extremes import Extremes
@@ -230,11 +231,17 @@ class PatternMethod(PlannedMethod[P]):
 
     def _watched(self, response: Response, average: int) -> Estimator:
         frames = FrameSet(response, even=self.even, distinct=self.distinct)
-        return Watched(self.separator(response, average), frames)
+        creep = Creep(response, len(self._patterns), balanced=self.balanced)
+        return Watched(self.separator(response, average), frames, creep)
 
     @property
     def even(self) -> bool:
         """Whether each pattern gives the scene as a whole the same light."""
+        return True
+
+    @property
+    def balanced(self) -> bool:
+        """Whether the patterns together light each place alike, and are no shifts of one."""
         return True
 
     @property

@@ -37,6 +37,11 @@ class SinusoidMethod(PatternMethod[Sinusoid]):
         """See `PatternMethod`."""
         return max(self.spec.periods) <= FINE_PX
 
+    @property
+    def balanced(self) -> bool:
+        """See `PatternMethod`."""
+        return False
+
     def described(self) -> str:
         """See `PatternMethod`."""
         count = len(self.spec.periods)

@@ -29,9 +29,10 @@ def stated(direct: Plane, indirect: Plane, *off: Plane) -> dict[str, NDArray[Any
     square = np.square(off[0])
     for one in off[1:]:
         square += np.square(one)
+    whole = [square + np.square(noise) for noise in (direct, indirect)]
     return {
-        "direct_std": np.sqrt(np.square(direct) + square),
-        "global_std": np.sqrt(np.square(indirect) + square),
+        "direct_std": np.sqrt(whole[0], out=whole[0]),
+        "global_std": np.sqrt(whole[1], out=whole[1]),
         "direct_noise": direct,
         "global_noise": indirect,
     }

@@ -183,7 +183,7 @@ class Extremes:
                 own = deviation * np.float32(1.0 / found.uneven)
                 judgement = Judgement(direct_limit, total_limit, own)
             uneven = self._uneven(low, high, found, noises)
-            planes = stated(*noises, found.place(b), found.bias(b, direct), uneven.off)
+            planes = stated(*noises, found.off(b, None if unbiased else direct), uneven.off)
             advice += uneven.advice
             flags = uneven.flags if flags is None else flags | uneven.flags
         saturated = self._saturated

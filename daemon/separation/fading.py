@@ -28,12 +28,15 @@ Mask = NDArray[np.bool_]
 _CHANGE = np.float32(0.5)  # of a turning pointer from a pixel to the next: an edge lies between
 _LEAST = 2.5  # pixels to a patch: finer ones have no middle
 _REACH = 0.35  # of a patch: the Gaussian that scatters
-_ACROSS = 3  # patches that are looked at together
+_ACROSS = 2  # patches, of a box: ...
+_BOXES = 3  # ... so many times over nothing is left of where in the pattern it began
+_PATCHES = 12.0  # that are looked at so, by their weight
 _SOME = 0.2  # of a neighbourhood must be whole
 _QUIET = 0.1  # of the light: a pixel of more noise tells little
 _EVEN = np.float32(0.005)  # variance of the scattered pattern: where it has less nothing is told
 _BRIGHT = 0.8  # of the strongest contrast: where light is direct the usual fading is looked for
-_SURE = 1.5  # times the usual spread, and the deviation of noise: less says nothing
+_SURE = 1.5  # times the usual spread: less says nothing
+_VARIES = 0.25  # of the usual fading: blur is not the same all over a scene
 _CORE = 3.14  # deviations of a Gaussian over the quarter of it that lies nearest to the middle
 _DEVIATIONS = 3.0  # of noise, and ...
 _PART = 0.1  # of the light: an error of more than both is flagged
@@ -112,13 +115,14 @@ def _faded(wave: Wave, contrast: Plane, noise: Plane) -> tuple[Plane, float]:
         return none, 0.0
     scattered = _scattered(turn, seen, _REACH * size)
     weight = seen.astype(np.float32)
-    across = int(_ACROSS * size) // 2 * 2 + 1
-    window = across, across
-    count = np.asarray(cv2.blur(weight, window))
+    border = int(2.0 * _REACH * size) + 1  # what would be scattered into it is not in the picture
+    for end in (np.s_[:border], np.s_[-border:]):
+        weight[end] = weight[:, end] = 0.0
+    window = (int(_ACROSS * size) // 2 * 2 + 1,) * 2
+    count = _around(weight, window)
 
     def mean(plane: Plane) -> Plane:
-        sums = np.asarray(cv2.blur(plane * weight, window))
-        return np.asarray(sums / np.maximum(count, _TINY), dtype=np.float32)
+        return np.asarray(_around(plane * weight, window) / np.maximum(count, _TINY))
 
     level, middle = mean(contrast), mean(scattered)
     spread = mean(np.square(scattered)) - np.square(middle)
@@ -131,11 +135,12 @@ def _faded(wave: Wave, contrast: Plane, noise: Plane) -> tuple[Plane, float]:
     slope = going / (spread * level)
     # what lies otherwise than the pattern may do so by chance, in as many ways as there are patches
     other = mean(np.square(contrast)) - np.square(level) - np.square(going) / spread
-    of_chance = np.maximum(other, 0) / (np.square(level) * spread * np.float32(_ACROSS**2))
+    of_chance = np.maximum(other, 0) / (np.square(level) * spread * np.float32(_PATCHES))
     usual = gathered(slope[lit])
     more = slope - np.float32(usual)
-    core = np.float32((_CORE * np.quantile(np.abs(more[lit]), 0.25)) ** 2)
-    beyond = np.square(np.maximum(more, 0)) - np.maximum(np.float32(_SURE**2) * core, of_chance)
+    usual_spread = _SURE * _CORE * float(np.quantile(np.abs(more[lit]), 0.25))
+    least = np.float32(max(usual_spread, _VARIES * usual) ** 2)
+    beyond = np.square(np.maximum(more, 0)) - np.maximum(least, of_chance)
     part: Plane = np.where(told, np.sqrt(np.clip(beyond, 0, 1)), np.float32(0))
     return part, max(usual, 0.0)
 
@@ -152,7 +157,14 @@ def _patch(turn: Wave, seen: Mask) -> float | None:
         pairs += int(np.count_nonzero(both))
     if not changes or pairs < _LEAST * changes:
         return None
-    return min(pairs / changes, float(min(turn.shape)) / _ACROSS)
+    return min(pairs / changes, float(min(turn.shape)) / (_ACROSS * _BOXES))
+
+
+def _around(plane: Plane, window: tuple[int, int]) -> Plane:
+    found = plane
+    for _ in range(_BOXES):
+        found = np.asarray(cv2.blur(found, window), dtype=np.float32)
+    return found
 
 
 def _scattered(turn: Wave, seen: Mask, sigma: float) -> Plane:

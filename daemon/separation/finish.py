@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation import deviation, mosaic
+from daemon.separation import deviation
 from daemon.separation.estimator import Components, Quality
+from daemon.separation.mosaic import Mosaic
 from daemon.separation.noise import noise_range
 from daemon.separation.radiometry import Plane, Response
 from daemon.separation.sampling import thinned
@@ -105,9 +106,7 @@ def finish(
     if response.bayer:
         # A colour is interpolated from its neighbours: what is wrong with them is wrong with it.
         quality = spread(quality, Quality.SATURATED)
-        direct, indirect = (mosaic.demosaic(x, response.bayer) for x in (direct, indirect))
-        for name in deviation.PLANES & planes.keys():
-            planes[name] = mosaic.demosaic_deviation(planes[name], response.bayer)
+        direct, indirect = _coloured(direct, indirect, planes, response.bayer)
         # Where none of them has a colour, the pixel is what they are.
         missed = ~unknown & np.isnan(direct + indirect).any(axis=2)
         around = spread(spread(quality, Quality.NEVER_LIT), Quality.NEVER_UNLIT)
@@ -132,6 +131,25 @@ def finish(
         "exposure_histogram": histogram(brightest, response.linear_full_scale),
     }
     return Components(direct, indirect, quality, planes, figures)
+
+
+def _coloured(
+    direct: Plane, indirect: Plane, planes: dict[str, NDArray[Any]], bayer: str
+) -> tuple[Plane, Plane]:
+    """The components' colours; those of their deviations, in place: with what a colour that is
+    interpolated may be off by."""
+    mosaic = Mosaic(np.isfinite(direct + indirect), bayer)
+    coloured = []
+    for component, name in zip((direct, indirect), deviation.NOISE, strict=True):
+        colours = mosaic.colours(component)
+        coloured.append(colours)
+        if name in planes:
+            noise, stated = deviation.of_noise(planes, name), planes[name]
+            off = np.square(mosaic.error(component, noise, colours))
+            off += np.square(mosaic.noise(stated))
+            planes[name] = np.sqrt(off)
+            planes[deviation.NOISE[name]] = mosaic.noise(noise)
+    return coloured[0], coloured[1]
 
 
 def judge(

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.creep import Creep, marked
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation, Result
 from daemon.separation.mosaic import orders_of
 from daemon.separation.radiometry import Plane, Response
@@ -274,17 +275,19 @@ def _stepped(order: list[int], off: NDArray[np.float64]) -> list[str]:
 
 
 class Watched:
-    """An estimator, and a `FrameSet` that sees the same frames and adds what it knows."""
+    """An estimator, and what sees the same frames and adds what it knows."""
 
-    def __init__(self, inner: Estimator, frames: FrameSet) -> None:
+    def __init__(self, inner: Estimator, frames: FrameSet, creep: Creep) -> None:
         self._inner = inner
         self._frames = frames
+        self._creep = creep
 
     def update(self, pixels: NDArray[Any], observation: Observation) -> None:
         """See `Estimator`."""
         self._inner.update(pixels, observation)
         if observation.used:
             self._frames.add(pixels, observation)
+            self._creep.add(pixels, observation)
 
     def result(self) -> Result:
         """See `Estimator`. Raises NotYet as the estimator does that it watches."""
@@ -292,7 +295,8 @@ class Watched:
         if not isinstance(result, Components):
             return result
         facts, lines, last = self._frames.told()
-        advice = [*lines, *result.facts.get("advice", ()), *last]
+        result, moved = marked(result, self._creep.told())
+        advice = [*lines, *moved, *result.facts.get("advice", ()), *last]
         return replace(result, facts={**result.facts, **facts, "advice": advice})
 
     def summary(self) -> dict[str, float]:

@@ -208,17 +208,16 @@ class Estimated:
         indirect *= np.float32(((1.0 - b) * g * self.uneven) ** -2)
         return np.maximum(direct, 0, out=direct), np.maximum(indirect, 0, out=indirect)
 
-    def place(self, b: float) -> Plane:
-        """How far components may be off, as a deviation, by where a pixel lies in the pattern: that
-        of a pixel like most, as a part of its step. What direct light lacks global light has."""
+    def off(self, b: float, biased: Plane | None) -> Plane:
+        """How far components may be off, as a deviation, by where a pixel lies in the pattern (that
+        of a pixel like most, as a part of its step: what direct light lacks global light has), and
+        by what noise and blur left in direct light if it is `biased`."""
         step: Plane = np.maximum(self.lit - self.unlit, np.float32(0.0))
         ratio, k = self._typical(step)
         lit, unlit, shared = self._of(_PLACE, ratio, k)
-        return step * np.float32(max(lit + unlit - 2.0 * shared, 0.0) ** 0.5 / (1.0 - b))
-
-    def bias(self, b: float, direct: Plane) -> Plane:
-        """What noise and blur have left in `direct` light: 0 where it is without."""
-        off: Plane = direct - (self.lit - self.unlit) * np.float32(1.0 / (1.0 - b))
+        off: Plane = step * np.float32(max(lit + unlit - 2.0 * shared, 0.0) ** 0.5 / (1.0 - b))
+        if biased is not None:
+            np.hypot(off, biased - (self.lit - self.unlit) * np.float32(1.0 / (1.0 - b)), out=off)
         return off
 
     def _typical(self, step: Plane) -> tuple[float, int]:

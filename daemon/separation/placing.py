@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -23,7 +24,8 @@ Motion = NDArray[np.float64]
 
 STILL: Motion = np.eye(3)
 
-_KEPT = 12  # of the frames, one in so many is a level's: its mean
+_KEPT = 12  # of the frames, one in so many makes a first guess at a level
+_FEWEST = 4  # frames that a level rests on: fewer are aligned with themselves
 _NEAR = 0.1  # of the way from one level to the other: a place that is at one
 _ASTRAY = 0.3  # px: edges of the scene that lie off by less are near, too
 _LEAST_SPAN = 0.25  # of the light: a shadow takes as much at least
@@ -33,7 +35,9 @@ _EDGE = 2  # pixels along the picture's rim that are left out: they come and go
 _MOST = 5_000  # places that are looked at
 _LEAST = 150  # places that tell anything
 _ROUNDS = 10
-_ENOUGH = 0.005  # px of a round's step
+_ENOUGH = 0.02  # px of a round's step
+_PART = 1 / 32  # px: pictures are moved by multiples of it
+_ANOTHER_LOOK = 0.1  # px of a step, after which other places may be near
 _TRUSTED = 2.0  # deviations beyond which a difference counts less and less
 _MEDIAN = 0.455  # of the square of a Gaussian of deviation 1
 _UNSHARP = 0.2  # px: an edge that is drawn between pixels may be off by it
@@ -41,32 +45,79 @@ _NINTH = np.full((3, 3), 1 / 9, np.float32)
 _GRADIENT = np.array([[-0.5, 0.0, 0.5]], np.float32)
 
 
-class Levels:
-    """What a scene looks like in light and in shadow; linear light, small and grey."""
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """Places of a picture that are near a level: where, the light that is expected there, and what
+    a step in x, in y and a turn make of it (n, 3)."""
 
-    def __init__(self, pictures: Sequence[Plane], motions: Sequence[Motion]) -> None:
-        """From frames that have moved so."""
-        height, width = pictures[0].shape
+    at: NDArray[np.intp]
+    light: NDArray[np.float32]
+    slopes: NDArray[np.float32]
+
+
+class Levels:
+    """What a scene looks like in light and in shadow; linear light, small and grey; NaN where that
+    is not known."""
+
+    def __init__(self, lit: Plane, unlit: Plane) -> None:
+        height, width = lit.shape
         self.middle = ((width - 1) / 2.0, (height - 1) / 2.0)
-        placed = [back(p, m) for p, m in zip(pictures, motions, strict=True)]
-        ranked = np.sort(np.stack(placed), axis=0)
-        few = max(1, len(placed) // _KEPT)
-        self._levels = [np.asarray(x.mean(0), np.float32) for x in (ranked[-few:], ranked[:few])]
+        self._levels = (lit, unlit)
         self._around = [_mean(x) for x in self._levels]
         self._slopes = [_slopes(x, self.middle) for x in self._levels]
-        lit, unlit = self._around
-        least = np.float32(_LEAST_SPAN) * np.abs(lit)
-        self._shaded = lit - unlit > least
-        span = np.maximum(lit - unlit, least)
+        least = np.float32(_LEAST_SPAN) * np.abs(self._around[0])
+        apart = self._around[0] - self._around[1]
+        self._shaded = apart > least
+        span = np.fmax(apart, least)
         self._near = [
             np.float32(_NEAR) * span + np.float32(_ASTRAY) * np.hypot(*_slopes(x, self.middle)[:2])
             for x in self._around
         ]
-        seen = self._levels[0][np.isfinite(self._levels[0])]
+        seen = lit[np.isfinite(lit)]
         bright = float(np.quantile(seen, 0.95)) if seen.size else 0.0
         self._noisy = np.float32(_FLOOR * max(bright, 1e-3))
         self._inner = np.zeros((height, width), np.bool_)
         self._inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
+
+    @classmethod
+    def guessed(cls, pictures: Sequence[Plane], motions: Sequence[Motion]) -> Levels:
+        """From the brightest and the darkest of frames that have moved so."""
+        placed = np.stack([back(p, m) for p, m in zip(pictures, motions, strict=True)])
+        few = max(1, len(placed) // _KEPT)
+        ends = []
+        for sign in (-1.0, 1.0):
+            first = np.where(np.isnan(placed), np.float32(np.inf), np.float32(sign) * placed)
+            first = np.partition(first, few - 1, axis=0)[:few].mean(0) * np.float32(sign)
+            ends.append(np.where(np.isfinite(first), first, np.float32(np.nan)))
+        return cls(*ends)
+
+    def gathered(self, pictures: Sequence[Plane], motions: Sequence[Motion]) -> Levels:
+        """The means of what is near each level in frames that have moved so: it is neither noise
+        nor an edge astray that makes them. Where `_FEWEST` frames are not, the level is not known.
+        """
+        sums = [np.zeros_like(x) for x in self._levels]
+        counts = [np.zeros_like(x) for x in self._levels]
+        for picture, motion in zip(pictures, motions, strict=True):
+            placed = back(picture, motion)
+            for k, near in enumerate(self._where(placed)):
+                where = near & np.isfinite(placed)
+                np.add(sums[k], placed, out=sums[k], where=where)
+                counts[k] += where
+        return Levels(
+            *(
+                np.divide(s, n, out=x.copy(), where=n >= _FEWEST)
+                for s, n, x in zip(sums, counts, self._levels, strict=True)
+            )
+        )
+
+    def _where(self, placed: Plane) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """The places of a frame that are in light, and in shadow."""
+        around = _mean(placed)
+        lit, unlit = (
+            np.abs(around - level) < near
+            for level, near in zip(self._around, self._near, strict=True)
+        )
+        return lit, unlit & self._shaded & ~lit
 
     def place(
         self, picture: Plane, motion: Motion, only: NDArray[np.bool_] | None = None
@@ -75,38 +126,49 @@ class Levels:
         None where too few places tell. `only`: where to look."""
         inner = self._inner if only is None else self._inner & only
         variance = np.full((3, 3), np.inf)
+        seen: _Seen | None = None
         for _ in range(_ROUNDS):
-            found = self._step(back(picture, motion), inner)
+            motion = self._snapped(motion)
+            placed = back(picture, motion)
+            seen = seen or self._look(placed, inner)
+            found = None if seen is None else self._step(placed, seen)
             if found is None:
                 return None
             step, variance = found
-            motion = motion @ self._turned(*step)
-            if self._reach(step) < _ENOUGH:
+            motion = motion @ inverse(rigid(step[0], step[1], step[2], self.middle))
+            reach = self._reach(step)
+            if reach < _ENOUGH:
                 break
+            if reach > _ANOTHER_LOOK:
+                seen = None
         return motion, variance
 
-    def _step(
-        self, picture: Plane, inner: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """By what x, y and turn a frame lies off, and their variance."""
-        around = _mean(picture)
-        lit, unlit = (
-            inner & (np.abs(around - level) < near)
-            for level, near in zip(self._around, self._near, strict=True)
-        )
-        unlit &= self._shaded & ~lit
+    def _look(self, placed: Plane, inner: NDArray[np.bool_]) -> _Seen | None:
+        """What is near its level in a frame."""
         parts = []
-        for where, light, slopes in zip((lit, unlit), self._levels, self._slopes, strict=True):
+        for near, light, slopes in zip(
+            self._where(placed), self._levels, self._slopes, strict=True
+        ):
+            where = near & inner & np.isfinite(light)
             at = np.flatnonzero(where)
             at = at[:: 1 + at.size // _MOST]
             if at.size < _LEAST:
                 continue
-            level = (light * _gain(picture, light, where)).ravel()[at]
-            parts.append((level, picture.ravel()[at] - level, slopes.reshape(3, -1)[:, at]))
+            gain = _gain(placed, light, where)
+            parts.append((at, (light * gain).ravel()[at], slopes.reshape(3, -1)[:, at].T))
         if not parts:
             return None
-        light, off, design = (np.concatenate([p[k] for p in parts], axis=-1) for k in range(3))
-        design = design.T
+        return _Seen(*(np.concatenate([p[k] for p in parts]) for k in range(3)))
+
+    def _step(
+        self, placed: Plane, seen: _Seen
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """By what x, y and turn a frame lies off, and their variance."""
+        off = placed.ravel()[seen.at] - seen.light
+        known = np.isfinite(off) & np.isfinite(seen.slopes).all(1)
+        off, light, design = off[known], seen.light[known], seen.slopes[known]
+        if off.size < _LEAST:
+            return None
         steep = np.square(design[:, 0]) + np.square(design[:, 1])
         shot = np.abs(light) + self._noisy
         flat = steep <= np.median(steep)
@@ -125,15 +187,21 @@ class Levels:
             return None  # nothing there tells of x, of y or of a turn
         return answer, variance
 
-    def _turned(self, x: float, y: float, turn: float) -> Motion:
-        """The motion that undoes a step."""
-        cos, sin = math.cos(turn), math.sin(turn)
-        middle = np.array(self.middle)
-        rotation = np.array([[cos, sin], [-sin, cos]])
-        undone = np.eye(3)
-        undone[:2, :2] = rotation
-        undone[:2, 2] = middle - rotation @ middle - np.array([x, y])
-        return undone
+    def _snapped(self, motion: Motion) -> Motion:
+        """The motion by which OpenCV moves a picture when it is told to move it by another: where
+        there is no turn to speak of, by whole parts of a pixel."""
+        turn = abs(motion[1, 0]) * math.hypot(*self.middle)
+        if turn > 0.5 * _PART:
+            return motion
+        moved = motion[:2] @ np.array([*self.middle, 1.0]) - self.middle
+        x, y = np.round(moved / _PART) * _PART
+        return shifted(float(x), float(y))
+
+    def apart(self, one: Motion, other: Motion) -> float:
+        """How far apart two motions bring the corner that they part most, px."""
+        right, below = 2.0 * self.middle[0], 2.0 * self.middle[1]
+        corners = np.array([[0, right, 0, right], [0, 0, below, below], [1, 1, 1, 1]])
+        return float(np.hypot(*((one - other)[:2] @ corners)).max())
 
     def _reach(self, step: NDArray[np.float64]) -> float:
         return float(np.hypot(step[0], step[1]) + abs(step[2]) * math.hypot(*self.middle))
@@ -142,6 +210,20 @@ class Levels:
 def shifted(x: float, y: float) -> Motion:
     """A motion without a turn."""
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
+
+
+def inverse(motion: Motion) -> Motion:
+    """The motion back."""
+    return np.asarray(np.linalg.inv(motion), np.float64)
+
+
+def rigid(x: float, y: float, turn: float, middle: tuple[float, float]) -> Motion:
+    """A shift and a turn about the middle of a picture, px and radians."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    motion = np.eye(3)
+    motion[:2, :2] = rotation = np.array([[cos, -sin], [sin, cos]])
+    motion[:2, 2] = middle - rotation @ middle + np.array([x, y])
+    return motion
 
 
 def back(picture: Plane, motion: Motion) -> Plane:
@@ -153,7 +235,7 @@ def back(picture: Plane, motion: Motion) -> Plane:
             picture,
             motion[:2],
             picture.shape[::-1],
-            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=math.nan,
         )

@@ -15,14 +15,15 @@ The first frames are the reference: they are aligned among themselves once they 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.placing import Levels, Motion, shifted
+from daemon.separation.placing import Levels, Motion, inverse, rigid, shifted
 from daemon.separation.radiometry import Plane, Response
 
 LEAST_PX = 0.1
@@ -44,9 +45,10 @@ Warp = tuple[float, float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 
 _WORK = 320  # longer side of the pictures that are compared
-_LEAST_SIDE = 200  # small pixels of the longer side
+_LEAST_SIDE = 64  # small pixels of the longer side
 _FLOOR = 0.03  # of the bright places: added to light, so that the dark ones' noise has no say
 _FOLLOWED = 0.25  # of the differences: only a mesh that was taken for the scene explains so much
+_SOFT = 0.5  # px: finer things interpolation moves by another way
 _TAPER = 0.08  # part of the picture at each edge that fades out
 _SHORTEST = (1, 16, 8, 4, 2, 1, 1, 1, 1)
 """Wavelengths, in small pixels, that count in each round of aligning the first frames: all, to see
@@ -55,10 +57,14 @@ _TOLD = 8.0  # deviations of a shift by which it is told from none: shadows make
 _ALIKE = 1e-6  # of a spectrum: less than any noise makes, for frames that are all the same
 _SETTLED = 0.15  # px: first frames that wander less from round to round lie apart as they do
 _TILE = 16  # small pixels: halves of the picture are a checkerboard of such squares
+_REFINED = 8  # rounds in which the first frames are placed
+_STIRRED = 0.02  # px: first frames that wander less from round to round are placed
+_ASTRAY = 1.5  # small px from where the correlation found a frame
+_MANY_ASTRAY = 0.25  # of the first frames: then it is not the scene that is followed
 _SAMPLED = 6  # every so many of the first frames show how far the halves agree
 
-_STEPS = 6  # of refining a peak
 _PEAK = 5.0  # deviations of the correlation by which a peak is told from chance
+_GREY = np.full((1, 3), 1 / 3, np.float32)
 _SHARE = 0.35  # of the height that the reference's own peak has
 
 
@@ -105,6 +111,7 @@ class Registration:
         self._response = response
         self._mesh = mesh
         self._explained = 0.0  # part of the first frames' differences that their shifts take away
+        self._astray = 0.0  # part of the first frames whose exact place is not confirmed
         self._first: list[Plane] = []
         self._levels: Levels | None = None  # None: there is no reference yet
         self._matched: Spectrum = np.zeros((0, 0), np.complex64)  # over the shadow's spectrum
@@ -121,7 +128,7 @@ class Registration:
         """How far the first frames lay from the middle of all, px."""
 
     def suits(self, shape: tuple[int, ...]) -> bool:
-        """Whether pictures of a shape are large enough: in tiny ones a fine mesh is all texture."""
+        """Whether pictures of a shape are large enough to be asked; `tells` knows more."""
         return max(shape[:2]) // self._reduced(shape) >= _LEAST_SIDE
 
     def _reduced(self, shape: tuple[int, ...]) -> int:
@@ -137,7 +144,8 @@ class Registration:
     def tells(self) -> bool:
         """Whether the scene has texture enough for places to be known."""
         followed = self._mesh and self._explained > _FOLLOWED
-        return max(self.sd, self._coarse_sd) < UNSURE_PX and not followed
+        known = max(self.sd, self._coarse_sd) < UNSURE_PX and self._astray < _MANY_ASTRAY
+        return known and not followed
 
     def learn(self, pixels: NDArray[Any]) -> None:
         """Take in a frame for the reference; the last of `REFERENCE` ones makes it."""
@@ -165,10 +173,25 @@ class Registration:
         found = height > max(_PEAK, _SHARE * self._noise) * self._noise
         near = shifted(x, y)
         exact = self._levels.place(small / np.float32(strength), near) if found else None
-        if exact is None:
+        if exact is None or not self._confirmed(exact[0], near):
             return self._place(near, False)
         motion, variance = exact
-        return self._place(motion, self._factor * _spread(variance) < UNSURE_PX)
+        place = self._place(motion, self._factor * _spread(variance) < UNSURE_PX)
+        if place.found and place.warp is not None:
+            apart = self._apart(small / np.float32(strength), motion)
+            place = replace(place, found=apart is not None and apart < 2.0 * place.least)
+        return place
+
+    def _apart(self, picture: Plane, motion: Motion) -> float | None:
+        """How far two halves of a picture, a checkerboard's squares, put it apart, px; None: one of
+        them tells nothing."""
+        assert self._levels is not None
+        rows, columns = np.indices(picture.shape) // _TILE
+        odd = (rows + columns) % 2 == 1
+        one, other = (self._levels.place(picture, motion, half) for half in (odd, ~odd))
+        if one is None or other is None:
+            return None
+        return self._factor * float(np.hypot(*(self._off(one[0]) - self._off(other[0]))))
 
     def _place(self, motion: Motion, found: bool) -> Place:
         """In pixels of the frame. A turn that no pixel feels is none."""
@@ -202,8 +225,11 @@ class Registration:
         small = pixels[: height * factor, : width * factor]
         if factor > 1:
             small = cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA)
-        grey = small.astype(np.float32) if small.ndim == 2 else small.mean(2, dtype=np.float32)
-        return self._response.linear_between(grey)
+        grey: Plane = small.astype(np.float32)
+        if grey.ndim == 3:
+            grey = np.asarray(cv2.transform(grey, _GREY), np.float32)
+        light = self._response.linear_between(grey)
+        return np.asarray(cv2.GaussianBlur(light, (3, 3), _SOFT), np.float32)
 
     def _spectrum(self, grey: Plane) -> Spectrum:
         """Of the logarithm of a small picture."""
@@ -239,7 +265,7 @@ class Registration:
             change = np.abs(shifts - before).max() * self._factor
             if shortest == 1 and change < _SETTLED:
                 break
-        self._place_first([shifted(*d) for d in shifts])
+        motions = self._place_first([shifted(*d) for d in shifts])
         moved = [self._moved(s, *d) for s, d in zip(spectra, shifts, strict=True)]
         mean = np.mean(moved, axis=0)
         shadow = np.mean([np.abs(s - mean) ** 2 for s in moved], axis=0) * count / (count - 1)
@@ -252,23 +278,47 @@ class Registration:
             self._coarse_sd = self._factor * math.sqrt(float(np.trace(np.linalg.inv(curvature))))
         unaligned = np.mean([np.abs(s - np.mean(spectra, axis=0)) ** 2 for s in spectra], 0)
         self._explained = 1.0 - _both(shadow) / max(_both(unaligned), 1e-9)
-        self.wandered = float(np.hypot(*shifts.T).max()) * self._factor
+        self.wandered = max(self._place(motion, True).px for motion in motions)
 
-    def _place_first(self, motions: list[Motion]) -> None:
-        """Make the levels that all others are placed by, of the first frames, which have moved so,
-        and see how well two halves of the picture agree about these."""
-        self._levels = levels = Levels(self._first, motions)
-        rows, columns = np.indices(self._first[0].shape) // _TILE
-        odd = (rows + columns) % 2 == 1
-        apart = []
-        for picture, motion in list(zip(self._first, motions, strict=True))[::_SAMPLED]:
-            halves = [levels.place(picture, motion, half) for half in (odd, ~odd)]
-            one, other = (None if half is None else self._off(half[0]) for half in halves)
-            if one is not None and other is not None:
-                apart.append(one - other)
+    def _place_first(self, motions: list[Motion]) -> list[Motion]:
+        """Make the levels that all others are placed by, of the first frames, which have moved
+        about so, and see how well two halves of the picture agree about these. Their motions."""
+        levels = self._levels = Levels.guessed(self._first, motions)
+        sure = [True] * len(motions)
+        for _ in range(_REFINED):
+            levels = self._levels = levels.gathered(
+                list(compress(self._first, sure)), list(compress(motions, sure))
+            )
+            before = motions
+            motions, sure = self._placed(levels, motions)
+            stirred = [levels.apart(*pair) for pair in zip(before, motions, strict=True)]
+            if self._factor * float(np.median(stirred)) < _STIRRED:
+                break
+        self._astray = 1.0 - sum(sure) / len(sure)
+        known = list(compress(zip(self._first, motions, strict=True), sure))
+        apart = [px for px in (self._apart(*pair) for pair in known[::_SAMPLED]) if px is not None]
         if apart:
             # of both halves together the deviation is half of their difference's
-            self.sd = self._factor * float(np.sqrt(np.mean(np.square(apart)) * 2.0)) / 2.0
+            self.sd = math.sqrt(float(np.mean(np.square(apart)))) / 2.0
+        return motions
+
+    def _placed(self, levels: Levels, near: list[Motion]) -> tuple[list[Motion], list[bool]]:
+        """The first frames' motions, found from ones that are `near`, and whether they are
+        confirmed by these; the middle one's is none."""
+        found = [levels.place(p, m) for p, m in zip(self._first, near, strict=True)]
+        motions, sure = [], []
+        for one, before in zip(found, near, strict=True):
+            lies = one is not None and self._confirmed(one[0], before)
+            motions.append(one[0] if one is not None and lies else before)
+            sure.append(lies)
+        turns = [math.atan2(m[1, 0], m[0, 0]) for m in motions]
+        x, y = np.median([self._off(m) for m in motions], axis=0)
+        middle = inverse(rigid(float(x), float(y), float(np.median(turns)), levels.middle))
+        return [m @ middle for m in motions], sure
+
+    def _confirmed(self, exact: Motion, near: Motion) -> bool:
+        """Whether a motion is the one that the correlation found: else it has gone astray."""
+        return float(np.hypot(*(self._off(exact) - self._off(near)))) < _ASTRAY
 
     def _off(self, motion: Motion) -> NDArray[np.float64]:
         """By how much the middle of a small picture is shifted."""
@@ -300,40 +350,12 @@ class Registration:
         surface = np.fft.irfft2(cross, s=self._shape) * (height * width)
         reach = max(2, round(MOST * max(self._shape)))
         rows, columns = (np.arange(-reach, reach + 1) % n for n in self._shape)
-        near = surface[np.ix_(rows, columns)]
-        at_y, at_x = np.unravel_index(int(np.argmax(near)), near.shape)
-        x, y = float(at_x) - reach, float(at_y) - reach
-        return self._refined(cross, x, y)
-
-    def _refined(self, cross: NDArray[Any], x: float, y: float) -> tuple[float, float, float]:
-        """The peak of the correlation near a whole pixel, by Newton's steps."""
-        assert self._waves is not None
-        fy, fx = self._waves
-        begin = np.array([x, y])
-        at = begin.copy()
-        height = 0.0
-        twice = np.full(fx.size, 2.0)  # half of the spectrum stands for all
-        twice[0] = twice[-1] = 1.0
-        for _ in range(_STEPS):
-            along = np.exp(1j * fx * at[0]) * twice
-            across = np.exp(1j * fy * at[1])
-            # sums over x first: rows of 1, fx, fx²
-            inner = cross @ np.stack([along, fx * along, fx * fx * along], axis=1)
-            sums = np.stack([across, fy * across, fy * fy * across]) @ inner
-            height = float(sums[0, 0].real)
-            slope = -np.array([sums[0, 1].imag, sums[1, 0].imag])
-            bend = -np.array(
-                [[sums[0, 2].real, sums[1, 1].real], [sums[1, 1].real, sums[2, 0].real]]
-            )
-            if bend[0, 0] >= 0.0 or np.linalg.det(bend) <= 0.0:
-                break
-            step = -np.linalg.solve(bend, slope)
-            at += np.clip(step, -0.5, 0.5)
-            if np.abs(step).max() < 1e-3:
-                break
-        if np.abs(at - begin).max() > 1.5:
-            return float(begin[0]), float(begin[1]), height
-        return float(at[0]), float(at[1]), height
+        inner = surface[np.ix_(rows[1:-1], columns[1:-1])]
+        top, left = np.unravel_index(int(np.argmax(inner)), inner.shape)
+        near = surface[np.ix_(rows[top : top + 3], columns[left : left + 3])]
+        (x, over_x), (y, over_y) = _vertex(near[1]), _vertex(near[:, 1])
+        height_there = float(near[1, 1]) + over_x + over_y
+        return x + float(left) + 1 - reach, y + float(top) + 1 - reach, height_there
 
 
 def _fading(length: int) -> Plane:
@@ -343,6 +365,16 @@ def _fading(length: int) -> Plane:
     window = np.ones(length, np.float32)
     window[:edge], window[-edge:] = rise, rise[::-1]
     return window
+
+
+def _vertex(three: NDArray[Any]) -> tuple[float, float]:
+    """Where a parabola through three heights, a peak's, is highest, and by how much more."""
+    before, peak, after = (float(v) for v in three)
+    bend = 2.0 * peak - before - after
+    if bend <= 0.0:
+        return 0.0, 0.0
+    at = (after - before) / (2.0 * bend)
+    return at, 0.5 * bend * at * at
 
 
 def _both(half: NDArray[Any]) -> float:

@@ -39,7 +39,7 @@ _DOUBTFUL = 2.0
 _DISTORTED = 0.05
 _BENT = 0.03  # of the wave: with more of it in its amplitude thrice a period, light was no sinusoid
 _ODD = 0.05  # with more of it in mean or amplitude once a period, frames are not of these phases
-_MANY = 0.2  # of the pixels
+_MANY = 0.1  # of the pixels
 
 
 class LeastSquares:

@@ -28,6 +28,7 @@ _PART = 0.1  # of the light: less is a bend of a tone curve, or light that was n
 _OFF = 0.02  # of the light, all over the picture
 _WHOLLY_OFF = 0.1  # from here nothing is said of single pixels
 _OVER = 0.005  # leakage above what the black frame allows
+_NOTED = 0.01  # of direct light, by which leakage may be wrong: it is said
 _PLAIN = 0.05  # relative spread of K/W below which it is no room's light
 _SPECK = 3  # pixels a side: what is smaller is noise
 _CALM = 9  # pixels a side over which light is averaged
@@ -87,10 +88,11 @@ def _calm(plane: Plane) -> Plane:
 
 
 def leaks(references: References, leakage: float) -> list[str]:
-    """What K/W says of the leakage b: with ambient light it is b or more, everywhere. Lines of
-    advice; [] without black and white frames."""
+    """What K/W says of the leakage b: with ambient light it is b or more, everywhere; less a frame
+    with the source off, (K - A)/(W - A), it is b. Lines of advice; [] without black and white
+    frames."""
     dark, lit = references.mean(Lighting.BLACK), references.mean(Lighting.WHITE)
-    clipped = references.white_saturated
+    off, clipped = references.mean(Lighting.AMBIENT), references.white_saturated
     if dark is None or lit is None or clipped is None:
         return []
     good = _good(dark, lit, clipped)
@@ -98,26 +100,60 @@ def leaks(references: References, leakage: float) -> list[str]:
         return []
     some = thinned(good)
     black, white = thinned(_calm(dark))[some], thinned(_calm(lit))[some]
-    low, middle, high = (float(q) for q in np.quantile(black / white, [0.25, 0.5, 0.75]))
+    middle = float(np.median(black / white))
     if middle < -_OVER:
         return [
             f"black frames are below black, by {-middle:.3f} of the light of white ones: the black "
             "level that was given is too high (--black, `umbra calibrate dark`)"
         ]
+    if off is not None:
+        room = thinned(_calm(off))[some]
+        return _measured((black - room) / (white - room), leakage)
+    return _bounded(black / white, white, leakage)
+
+
+def _bounded(ratio: Plane, white: Plane, leakage: float) -> list[str]:
+    """What K/W, a bound of the leakage, says of the one given."""
+    least, low, middle, high, most = _quantiles(ratio, 0.05, 0.25, 0.5, 0.75, 0.95)
     if leakage > middle + _OVER:
         return [
             f"the leakage {leakage:g} cannot be: black frames have {middle:.3f} of the light of "
             "white ones, ambient light included: measure it with `umbra calibrate leak`, or give "
             f"--leakage {max(middle, 0.0):.3f} at most"
         ]
-    dim, typical, bright = (float(q) for q in np.quantile(white, [0.25, 0.5, 0.75]))
+    dim, typical, bright = _quantiles(white, 0.25, 0.5, 0.75)
     scatter = (high - low) / max(middle - leakage, 1e-6)
     contrast = (bright - dim) / max(typical, 1e-6)
     # an even light would make K/W differ as much as W does
-    if middle > leakage + 0.01 and scatter < min(_PLAIN, 0.5 * contrast):
+    if middle > leakage + _NOTED and scatter < min(_PLAIN, 0.5 * contrast):
         return [
             f"black frames have {middle:.3f} of the light of white ones all over the picture, as "
             f"leakage does and a room's light seldom, but it is taken as {leakage:g}: "
             f"give --leakage {middle:.3f}, or measure it with `umbra calibrate leak`"
         ]
+    if leakage == 0.0 and most > _NOTED:
+        return [
+            f"leakage is taken as none, and black frames have {max(least, 0.0):.3f} to {most:.3f} "
+            "of the light of white ones, the room's light included: where that is leakage direct "
+            f"is too small by as much, up to {most:.1%} (by {max(least, 0.0):.1%} at most if it "
+            "is alike all over), and global too large: run `umbra calibrate leak`, or add a frame "
+            "with the source off (--ambient-frame), which tells leakage from the room's light"
+        ]
     return []
+
+
+def _measured(found: Plane, leakage: float) -> list[str]:
+    """What the leakage, as black, white and source-off frames have it, says of the one given."""
+    low, middle, high = _quantiles(found, 0.05, 0.5, 0.95)
+    if max(abs(low - leakage), abs(high - leakage)) <= _NOTED:
+        return []
+    return [
+        f"black, white and source-off frames have a leakage of {middle:.3f} ({low:.3f} to "
+        f"{high:.3f} over the picture), but it is taken as {leakage:g}: direct is wrong by the "
+        f"difference, up to {max(abs(low - leakage), abs(high - leakage)):.1%} of it: give "
+        f"--leakage {max(middle, 0.0):.3f}, or measure it with `umbra calibrate leak`"
+    ]
+
+
+def _quantiles(values: Plane, *at: float) -> list[float]:
+    return [float(q) for q in np.quantile(values, at)]

@@ -131,6 +131,21 @@ class FrameStore:
             store._lines = Journal(folder / LINES)
         return store
 
+    @classmethod
+    def begin(
+        cls,
+        folder: Path,
+        shape: tuple[int, ...],
+        dtype: DTypeLike,
+        *,
+        pixels: bool,
+        resuming: bool,
+    ) -> FrameStore:
+        """The store of a run that begins, or (`resuming`) goes on where it has frames already."""
+        if resuming and (folder / LINES).exists():
+            return cls.open(folder)
+        return cls.create(folder, shape, dtype, pixels)
+
     # ------------------------------------------------------------ writing
 
     def append(self, pixels: NDArray[Any], record: FrameRecord) -> FrameRecord:

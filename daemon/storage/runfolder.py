@@ -23,7 +23,7 @@ class RunFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     `order` is the place in the queue, the least first; `rig` the devices and settings at the
     start; `bench` what the method was told of them (`Bench`, without its calibration); `timings`
-    seconds by name; `estimates` of frames, seconds and bytes before the start.
+    seconds by name; `estimates` of frames and bytes before the start.
     """
 
     format: int = FORMAT

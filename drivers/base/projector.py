@@ -20,7 +20,6 @@ class SequenceLimits:
     images: int  # at most, in one sequence
     bits: int  # 1: black and white only; 8: grey levels
     period_us: tuple[float, float]  # the shortest and the longest from one image to the next
-    dark_us: float = 0.0  # at least this, where an image is lit for less than its period
     total_us: float = 0.0  # all images together at most; 0: any
 
 

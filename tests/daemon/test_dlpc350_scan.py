@@ -206,6 +206,8 @@ def test_a_whole_scan_is_one_sequence(lab: Lab) -> None:
     end, file = lab.scan(SCAN, lab.config(camera='faults = ["drop-trigger@11"]'))
     assert end.state is RunState.DONE, end.reason
     assert (file.recorded, file.missing) == (27, 0)
+    assert file.estimates["frames"] == 27
+    assert file.estimates["bytes"] > 27 * 160 * 120
     assert file.sequencing["mode"] == "hardware"
     assert file.sequencing["counts"] == {"repeated": 1, "hardware": 27}
     assert lab.board.dark

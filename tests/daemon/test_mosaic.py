@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from daemon.separation.estimator import Observation
 from daemon.separation.extremes import Extremes
-from daemon.separation.mosaic import colour_masks, demosaic, orders_of
+from daemon.separation.mosaic import Mosaic, colour_masks, demosaic, orders_of
 from daemon.separation.radiometry import Response
 
 ORDERS = ["RG", "GR", "GB", "BG"]
@@ -56,6 +56,32 @@ def test_a_missing_sample_does_not_spread() -> None:
     found = demosaic(mosaic, "RG")
     assert np.isnan(found).sum() == 1  # its own colour alone
     assert np.isnan(found[4, 4, 0])
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+@pytest.mark.parametrize("sigma", [0.001, 0.03])
+def test_what_fine_texture_puts_a_colour_off_by_is_stated(sigma: float, coloured: bool) -> None:
+    rng = np.random.default_rng(2)
+    grains = rng.normal(0, 1, (120, 160, 3 if coloured else 1)).astype(np.float32)
+    texture = cv2.GaussianBlur(grains, (0, 0), 1.5).reshape(120, 160, -1)
+    rgb = np.asarray(1 + 0.1 * texture / texture.std() * np.ones(3), dtype=np.float32)
+    plane = mosaic_of(rgb, "GB") + rng.normal(0, sigma, (120, 160)).astype(np.float32)
+    noise = np.full(plane.shape, sigma, dtype=np.float32)
+    mosaic = Mosaic(np.ones(plane.shape, dtype=np.bool_), "GB")
+    found = mosaic.colours(plane)
+    stated = np.hypot(mosaic.noise(noise), error := mosaic.error(plane, noise, found))
+    own = np.moveaxis(colour_masks((120, 160), "GB"), 0, 2)
+    off = np.abs(found - rgb)
+    assert not np.any(error[own])
+    assert 0.6 < np.median(off[~own] / stated[~own]) / 0.6745 < 1.3
+    assert np.mean(off > 5 * stated) < 0.01
+
+
+def test_noise_is_less_where_a_colour_is_of_several_samples() -> None:
+    ones = np.ones((8, 10), dtype=np.float32)
+    noise = Mosaic(ones > 0, "RG").noise(ones)[2:-2, 2:-2]
+    assert noise[0, 0] == pytest.approx([1, 1 / 2, 1 / 2])  # red
+    assert noise[0, 1] == pytest.approx([1 / 2**0.5, 1, 1 / 2**0.5])
 
 
 def test_an_unknown_order_is_refused() -> None:

@@ -159,7 +159,7 @@ def test_a_wall_without_texture_tells_nothing_and_says_so() -> None:
         for frame in frames(there, texture=0.0):
             camera.learn(frame)
         assert not camera.tells  # what moves there is the mesh
-    assert not Registration(DEEP).suits((120, 160))
+    assert not Registration(DEEP).suits((48, 60))
     with pytest.raises(ValueError, match="no reference"):
         Registration(DEEP).of(frames(STILL[:1])[0])
 

@@ -95,8 +95,10 @@ def test_components_and_phase_come_back(count: int, leakage: float, ambient: flo
     apart = (found.planes["phase"] - phi + np.pi) % tau - np.pi
     assert np.abs(apart).max() < 1e-3
     assert found.facts["mean_ratio"] == pytest.approx(1.0, abs=1e-3)
-    # a picture whose pixels are all different may be noise for all that three phases tell
-    assert not [line for line in found.facts["advice"] if "show no pattern" not in line]
+    # a picture whose pixels are all different may be noise for all that three phases tell; and none
+    # can tell a room's light from a leakage that is taken as none
+    usual = ("show no pattern", "leakage is taken as none")
+    assert not [line for line in found.facts["advice"] if not any(u in line for u in usual)]
 
 
 @pytest.mark.parametrize("count", [3, 7, 25])

@@ -254,6 +254,22 @@ def test_too_large_a_leakage_is_told_with_references(name: str) -> None:
     assert _says(found, "leakage 0.2 cannot be")
 
 
+@pytest.mark.parametrize("name", ["checkerboard", "two-image", "sinusoid 8", "gray-code x"])
+def test_a_leakage_that_is_not_given_is_bounded_by_references(name: str) -> None:
+    """The room's light is .02 of full scale, white .55: K/W is .05 and more."""
+    found = _judged(name, BLACK_WHITE, scene=_scene(), radiometry=Radiometry())
+    assert _says(found, "leakage is taken as none, and black frames have 0.0")
+    assert not _says(_judged(name, BLACK_WHITE), "leakage")
+
+
+def test_a_frame_with_the_source_off_tells_the_leakage() -> None:
+    every = (Reference.AMBIENT, *BLACK_WHITE)
+    found = _judged("checkerboard", every, radiometry=Radiometry())
+    assert _says(found, "have a leakage of 0.02")
+    assert _says(_judged("checkerboard", every, radiometry=Radiometry(leakage=0.1)), "of 0.02")
+    assert not _says(_judged("checkerboard", every), "leakage")
+
+
 @pytest.mark.parametrize("name", ALL)
 def test_too_high_a_black_level_is_told_and_harmless_with_references(name: str) -> None:
     found = _judged(name, BLACK_WHITE, radiometry=Radiometry(leakage=0.02, black=6000.0))

@@ -39,10 +39,11 @@ def good(run: Run) -> RunInfo:
 @pytest.mark.parametrize(
     ("mode", "faults", "seen"),
     [
-        # in the first four of five runs of the sequence
+        # One in each of the first four of five runs of the sequence: the trigger in the first, for
+        # how many pulses a run has had when it is given up is a matter of time.
         (
             "hardware",
-            ("duplicate-frame@9", "incomplete-frame@14", "torn-frame@30", "drop-trigger@45"),
+            ("drop-trigger@5", "duplicate-frame@9", "incomplete-frame@14", "torn-frame@30"),
             "torn",
         ),
         ("software", ("drop-trigger@6", "torn-frame@12", "duplicate-frame@16"), "torn"),
@@ -57,7 +58,7 @@ def test_faults_on_the_way_cost_time_only(
     with daemon.start() as rig:
         info = good(rig.scan(umbra.Checkerboard(mode=mode)))
         assert counts(info)[mode] == 27
-        assert counts(info)["repeated"] >= {"hardware": 3, "software": 2, "free": 1}[mode]
+        assert counts(info)["repeated"] >= {"hardware": 4, "software": 2, "free": 1}[mode]
     assert seen in daemon.log()
     assert "exposed again" in daemon.log()
 
@@ -66,7 +67,7 @@ def test_auto_takes_sequences_where_the_wire_is_stated(daemon: Daemon) -> None:
     daemon.configure(
         camera=DEEP + 'faults = ["false-trigger@29"]',
         more=PATIENCE + "trigger_wired = true",
-        scale=2,
+        scale=1,
     )
     with daemon.start() as rig:
         run = rig.scan(umbra.Checkerboard())

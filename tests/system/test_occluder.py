@@ -83,11 +83,14 @@ def test_the_time_limit_ends_it_and_says_so(bench: Daemon) -> None:
         assert info.end.reason.startswith("the time limit of 2 s: ")
         progress_file = json.loads((bench.data / "runs" / run.id / "quality.json").read_text())
         assert 0 < progress_file["coverage"] < 1
-        info = rig.scan(msgspec.structs.replace(limited, time_limit_s=1e-6)).wait(60, check=False)
+        run = rig.scan(msgspec.structs.replace(limited, time_limit_s=1e-6))
+        info = run.wait(60, check=False)
         assert info.state is RunState.FAILED
         assert info.end is not None
         assert info.end.code == "no_result"
         assert "needs 2 frames, 0 came so far. It ended for: the time limit" in info.end.reason
+        rig.resume(run.id)  # it goes on from there, for as short a time
+        assert run.wait(60, check=False).state is RunState.FAILED
 
 
 def test_abort_and_pause_hold_the_stage(bench: Daemon) -> None:
