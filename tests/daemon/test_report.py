@@ -233,6 +233,7 @@ def test_photographs_have_no_times_nor_settings_of_a_camera() -> None:
         "waited",
         "a second",
         "software",
+        " mode ",
         " gain ",
         "auto exp",
     ):

@@ -117,11 +117,10 @@ def asked(file: RunFile) -> Iterable[tuple[str, Any]]:
 
 def in_step(file: RunFile) -> Iterable[tuple[str, Any]]:
     """How exposures were kept in step with patterns."""
-    if file.sequencing is not None:
+    if file.sequencing is not None and not of_recording(file):
         yield "mode", f"{file.sequencing['mode']}: {file.sequencing['why']}"
-        if not of_recording(file):
-            for name, count in file.sequencing["counts"].items():
-                yield f"exposures {name}", count
+        for name, count in file.sequencing["counts"].items():
+            yield f"exposures {name}", count
 
 
 def told(spec: AnyScan) -> Iterable[tuple[str, Any]]:

@@ -39,6 +39,8 @@ from protocol.scans.projected import PatternScan
 _ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a word of advice
 _DIM_BELOW = 0.25  # of full scale: a scene that uses less than this is under-exposed
 _MANY_LOST = 0.1  # of a video's frames
+_OF_A_RIG = {"auto_exposure", "coverage", "frame_rate_hz", "sweeps", "time_limit_s"}
+"""Of a scan: how photographs were taken does not follow from it."""
 _FOOTER = (
     "Pictures are for eyes: sRGB, all at one scale, clipped. The measurements are in the TIFF "
     "files: linear, float32, NaN where nothing was measured."
@@ -220,7 +222,7 @@ def _settings(subject: Subject) -> Iterable[tuple[str, Any]]:
             yield key, subject.facts[key]
     yield from in_step(subject.file)
     known = {"method", "note", "exposure_us", "gain", "lit_fraction", "estimator", "radiometry"}
-    known |= {"mode"} | ({"auto_exposure", "frame_rate_hz"} if photographs else set())
+    known |= {"mode"} | (_OF_A_RIG if photographs else set())
     yield from ((key, value) for key, value in told(subject.file.spec) if key not in known)
     yield "pictures show as white", f"{subject.white:.4g} counts"
 
