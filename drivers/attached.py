@@ -99,7 +99,11 @@ class AttachedCamera(Camera):
     def info(self) -> CameraInfo:
         """See Camera."""
         if self._info is None:
-            raise self._refused("info", "not connected", "connect it first")
+            raise self._refused(
+                "info",
+                "not connected",
+                "check its power and cable, and wait until it is connected again",
+            )
         return self._info
 
     def settings(self) -> CameraSettings:
@@ -122,7 +126,11 @@ class AttachedCamera(Camera):
 
     def _connected(self, phase: str) -> None:
         if self._info is None:
-            raise self._refused(phase, "not connected", "connect it first")
+            raise self._refused(
+                phase,
+                "not connected",
+                "check its power and cable, and wait until it is connected again",
+            )
 
     def _unless_halted(self, phase: str) -> None:
         if self._halted.is_set():

@@ -144,7 +144,11 @@ class DisplayProjector(Projector):
 
     def _show(self, image: NDArray[np.uint8], phase: str) -> int:
         if self._pixels is None:
-            raise self._lost(phase, "not connected", "connect it first")
+            raise self._lost(
+                phase,
+                "not connected",
+                "check its power and cable, and wait until it is connected again",
+            )
         size = (self._info.height, self._info.width)
         if image.dtype != np.uint8 or image.shape not in {size, (*size, 3)}:
             raise DeviceRefused(
@@ -167,7 +171,11 @@ class DisplayProjector(Projector):
     def _ask(self, call: Call, phase: str, timeout_s: float = CALL_S) -> Any:
         """One call, answered. Raises the window's DeviceError, DeviceLost where nothing answers."""
         if self._calls is None:
-            raise self._lost(phase, "not connected", "connect it first")
+            raise self._lost(
+                phase,
+                "not connected",
+                "check its power and cable, and wait until it is connected again",
+            )
         try:
             self._calls.send(call)
             if not self._calls.poll(timeout_s):

@@ -178,7 +178,12 @@ class DisplayWindow(Projector):
 
     def _check_window(self, phase: str) -> None:
         if self._surface is None:
-            raise DeviceLost(self.name, phase, "not connected", "connect it first")
+            raise DeviceLost(
+                self.name,
+                phase,
+                "not connected",
+                "check its power and cable, and wait until it is connected again",
+            )
         try:
             closed = [
                 event

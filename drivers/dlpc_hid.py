@@ -186,7 +186,12 @@ class DlpcHid:
 
     def _exchange(self, flags: int, command: int, data: bytes, phase: str) -> bytes:
         if self._usb is None:
-            raise DeviceLost(self.device, phase, "not connected", "connect it first")
+            raise DeviceLost(
+                self.device,
+                phase,
+                "not connected",
+                "check its power and cable, and wait until it is connected again",
+            )
         self._sequence = (self._sequence + 1) % 256
         with self._errors(phase):
             for report in message(flags, self._sequence, command, data):

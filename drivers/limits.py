@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from drivers.base.errors import DeviceRefused
+from drivers.base.errors import OutOfRange
 from drivers.base.stage import StageInfo
 from drivers.track import Arc
 
@@ -17,7 +17,7 @@ NEAR_MM = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Each check raises DeviceRefused, which names what was asked, the limit, and the remedy."""
+    """Each check raises OutOfRange, which names what was asked, the limit, and the remedy."""
 
     device: str
     info: StageInfo
@@ -26,7 +26,7 @@ class Limits:
         """`feed` in mm/s."""
         most = self.info.max_feed_mm_s
         if not 0 < feed <= most * (1 + 1e-9):
-            raise DeviceRefused(
+            raise OutOfRange(
                 self.device, phase, f"a feed of {feed:g} mm/s", f"it takes up to {most:g} mm/s"
             )
 
@@ -35,7 +35,7 @@ class Limits:
         for axis, box, travel in zip("xy", (x, y), self.info.travel_mm, strict=True):
             for value in box:
                 if not travel[0] <= value <= travel[1]:  # false for nan too
-                    raise DeviceRefused(
+                    raise OutOfRange(
                         self.device,
                         phase,
                         f"{axis} = {value:g} mm is outside {travel[0]:g} to {travel[1]:g} mm, its "
@@ -47,15 +47,15 @@ class Limits:
         """The whole circle, however little of it is gone round."""
         (x, y), r = arc.centre, arc.radius
         if not (math.isfinite(r) and r > 0):
-            raise DeviceRefused(self.device, phase, f"its radius is {r} mm", "above 0")
+            raise OutOfRange(self.device, phase, f"its radius is {r} mm", "above 0")
         if not turns > 0:
-            raise DeviceRefused(self.device, phase, f"{turns} turns were asked", "above 0")
+            raise OutOfRange(self.device, phase, f"{turns} turns were asked", "above 0")
         if self.info.only_circle_mm is None:
             self.check_box(phase, (x - r, x + r), (y - r, y + r))
             return
         own, turned = self.info.only_circle_mm
         if not (abs(r - turned) <= NEAR_MM and math.dist(arc.centre, own) <= NEAR_MM):
-            raise DeviceRefused(
+            raise OutOfRange(
                 self.device,
                 phase,
                 f"a circle of {r:g} mm about ({x:g}, {y:g})",

@@ -142,9 +142,14 @@ class ReplayCamera(Camera):
         return CameraSettings(
             exposure_us=self.options.exposure_us or None,
             pixel_format=info.pixel_format,
-            frame_rate_hz=info.max_rate_hz,
+            frame_rate_hz=self._known_rate(),
             roi=(0, 0, info.width, info.height),
         )
+
+    def _known_rate(self) -> float | None:
+        """As the options or a video say; photographs were taken at none."""
+        recording = self._connected("settings")
+        return recording.rate_hz if self.options.rate_hz or recording.video else None
 
     def configure(self, wanted: CameraSettings) -> CameraSettings:
         """The frames were taken before: anything but what they have is refused."""

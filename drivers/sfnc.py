@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.base.camera import Acquisition, CameraInfo, CameraSettings
 from drivers.base.device import Context, Identity
-from drivers.base.errors import DeviceGarbled
+from drivers.base.errors import DeviceGarbled, OutOfRange
 from drivers.base.pixelformat import PixelFormat
 from drivers.clock import NS
 from drivers.streaming import Buffer, StreamingCamera, StreamingOptions
@@ -123,7 +123,11 @@ class SfncCamera(StreamingCamera):
 
     def _nodes(self, phase: str) -> Nodes:
         if self._nodes_or_none is None:
-            raise self._refused(phase, "not connected", "connect it first")
+            raise self._refused(
+                phase,
+                "not connected",
+                "check its power and cable, and wait until it is connected again",
+            )
         return self._nodes_or_none
 
     # ------------------------------------------------------------ opening
@@ -226,8 +230,8 @@ class SfncCamera(StreamingCamera):
     def _in_range(self, nodes: Nodes, node: str, value: float, phase: str) -> None:
         low, high, _ = nodes.range(node)
         if not low <= value <= high:
-            raise self._refused(
-                phase, f"{node} {value:g} is out of range", f"choose {low:g} to {high:g}"
+            raise OutOfRange(
+                self.name, phase, f"{node} {value:g} is out of range", f"choose {low:g} to {high:g}"
             )
 
     def _layouts(self, nodes: Nodes) -> dict[str, Layout]:
@@ -257,7 +261,8 @@ class SfncCamera(StreamingCamera):
             if whole is None:
                 whole = high + (float(nodes.get(offset)) if movable else 0)
             if not low <= length <= whole or (step > 1 and (length - low) % step):
-                raise self._refused(
+                raise OutOfRange(
+                    self.name,
                     phase,
                     f"{size} {length} is not possible",
                     f"choose {low:g} to {whole:g} in steps of {max(1, step):g}",
@@ -265,7 +270,8 @@ class SfncCamera(StreamingCamera):
             last = whole - length if movable else 0
             grid = max(1, nodes.range(offset)[2]) if movable else 1
             if not 0 <= at <= last or at % grid:
-                raise self._refused(
+                raise OutOfRange(
+                    self.name,
                     phase,
                     f"{offset} {at} is not possible with {size} {length}",
                     f"choose 0 to {last:g} in steps of {grid:g}",

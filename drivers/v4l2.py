@@ -23,7 +23,14 @@ from numpy.typing import NDArray
 from drivers import imagefile
 from drivers.base.camera import Acquisition, CameraInfo, CameraSettings
 from drivers.base.device import Context, Identity
-from drivers.base.errors import DeviceError, DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.errors import (
+    DeviceError,
+    DeviceGarbled,
+    DeviceLost,
+    DeviceRefused,
+    DeviceTimeout,
+    OutOfRange,
+)
 from drivers.imagefile import BadImage
 from drivers.streaming import Buffer, StreamingCamera, StreamingOptions
 from drivers.unpack import Layout
@@ -157,7 +164,11 @@ class V4l2Camera(StreamingCamera):
     @property
     def _node(self) -> Node:
         if self._node_or_none is None:
-            raise self._refused("use", "not connected", "connect it first")
+            raise self._refused(
+                "use",
+                "not connected",
+                "check its power and cable, and wait until it is connected again",
+            )
         return self._node_or_none
 
     # ------------------------------------------------------------ settings
@@ -257,7 +268,8 @@ class V4l2Camera(StreamingCamera):
         """The control that can take this value."""
         control = self._controls[self._control((name,), phase)]
         if not control.minimum <= value <= control.maximum:
-            raise self._refused(
+            raise OutOfRange(
+                self.name,
                 phase,
                 f"{name} {value} is out of range",
                 f"choose {control.minimum} to {control.maximum}",

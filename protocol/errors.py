@@ -19,7 +19,7 @@ class Code(enum.StrEnum):
     UNKNOWN_PRODUCT = "unknown_product"
     WRONG_STATE = "wrong_state"  # e.g. resume of a run that is done
     NO_RESULT = "no_result"  # no frame has been separated yet
-    UNSUITABLE = "unsuitable"  # the rig lacks what the scan needs, or the numbers don't fit it
+    UNSUITABLE = "unsuitable"  # the rig lacks what is asked for, or the numbers don't fit it
     NOT_READY = "not_ready"  # what a run waited for before its first frame did not come in time
     ESTOPPED = "estopped"  # an emergency stop is in force until it is reset
     DEVICE_MISSING = "device_missing"  # the rig has no such device

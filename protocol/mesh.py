@@ -137,7 +137,8 @@ def best_circle(mesh: Mesh, penumbra: float = 0.0) -> Circle:
         raise ValueError(
             f"no circle lights and shades every point: a penumbra of {penumbra:.2g} mm is too wide "
             f"for holes of {mesh.hole_mm:g} mm at a pitch of {mesh.pitch_mm:g} mm: bring the mesh "
-            "nearer to the scene, or take a coarser one"
+            "nearer to the scene, take a coarser one, or say the source's angle, if it is smaller "
+            "than the sun's (--source-deg)"
         )
     return next(c for c in tried if min(c.lit, c.unlit) >= _NEAR_BEST * most)
 

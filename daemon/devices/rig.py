@@ -265,6 +265,7 @@ class Rig:
             self._set(member, Health.READY, "")
 
     def _set(self, member: _Member, health: Health, message: str) -> None:
+        message = message.removeprefix(f"{member.device.name}: ")  # it is said beside the name
         if (member.health, member.message) == (health, message):
             return
         member.health, member.message = health, message

@@ -145,7 +145,7 @@ def periods(exposure_us: float, refresh_hz: float) -> Check:
 def lit(name: str, dark: Shot, light: Shot) -> list[Check]:
     """Whether light changes the frame, and does not saturate it."""
     gain = light.mean - dark.mean
-    told = f"dark {100 * dark.mean:.1f} %, lit {100 * light.mean:.1f} % of full scale"
+    told = f"dark {100 * dark.mean:.1f}%, lit {100 * light.mean:.1f}% of full scale"
     if gain < _SEEN:
         return [
             failed(
@@ -158,7 +158,7 @@ def lit(name: str, dark: Shot, light: Shot) -> list[Check]:
         return [
             warning(
                 name,
-                f"{told}, {100 * light.saturated:.1f} % of the pixels saturated",
+                f"{told}, {100 * light.saturated:.1f}% of the pixels saturated",
                 f"umbra camera --exposure {light.exposure_us / 2:.0f}, or close the aperture",
             )
         ]
@@ -175,7 +175,7 @@ def latency(dark: Shot, early: Shot, light: Shot, flip_ns: int) -> Check:
         missing_ms = (1 - share) * early.exposure_us / 1e3
         return failed(
             name,
-            f"a frame that begins at the flip has {100 * share:.0f} % of its light: it comes some "
+            f"a frame that begins at the flip has {100 * share:.0f}% of its light: it comes some "
             f"{missing_ms:.1f} ms later than the projector says",
             "umbra calibrate latency, which scans then apply",
         )

@@ -14,11 +14,13 @@ from drivers.base.errors import (
     DeviceRefused,
     DeviceTimeout,
     EndOfRecording,
+    OutOfRange,
 )
 from protocol.errors import Code, UmbraError
 
 _KINDS: tuple[tuple[type[DeviceError], Code], ...] = (
     (EndOfRecording, Code.BAD_INPUT),
+    (OutOfRange, Code.UNSUITABLE),
     (DeviceLost, Code.DEVICE_LOST),
     (DeviceTimeout, Code.DEVICE_TIMEOUT),
     (DeviceRefused, Code.DEVICE_REFUSED),

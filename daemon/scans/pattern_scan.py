@@ -18,9 +18,10 @@ from daemon.scans.parameters import exposure_of, leakage_of, noise_of, response_
 from daemon.scans.planned import PlannedMethod, exposures, references
 from daemon.separation.bracket import Bracketed
 from daemon.separation.creep import Creep
-from daemon.separation.estimator import Estimator, Lighting, Observation
+from daemon.separation.estimator import Components, Estimator, Lighting, Observation, Quality
 from daemon.separation.exposure_noise import ROUNDING, Sensor
 from daemon.separation.extremes import Extremes
+from daemon.separation.finish import ADVICE
 from daemon.separation.frameset import FrameSet, Watched
 from daemon.separation.order_estimate import KEEP, LEAST, LEAST_FOR_BLUR
 from daemon.separation.radiometry import Response
@@ -30,6 +31,8 @@ from protocol.scans.spec import Reference
 
 FINE_PX = 64
 """Patterns of larger checkers, patches or periods may light one end of a scene alone."""
+
+_BRACKET = "what saturates is measured too by several exposures of each pattern: --bracket 0.25,1"
 
 # Where `levels` looks at a pattern set: places of a square of projector pixels, with a margin for
 # blur; all places of a period where it is short, else so many at random.
@@ -202,6 +205,15 @@ class PatternMethod(PlannedMethod[P]):
             exposure=step.exposure,
             exposure_us=taken.exposure_us if self._own_us else 0.0,
         )
+
+    def conclude(self, components: Components) -> Components:
+        """See `Method`: with what a bracket, which only patterns have, does for what saturates."""
+        components = super().conclude(components)
+        saturated = float(np.mean(components.quality & np.uint16(Quality.SATURATED) != 0))
+        if self.spec.bracket is not None or saturated <= ADVICE[Quality.SATURATED][0]:
+            return components
+        advice = [*components.facts.get("advice", ()), _BRACKET]
+        return replace(components, facts={**components.facts, "advice": advice})
 
     def estimator(self) -> Estimator:
         """See `Method`. Exposures of a bracket are merged before the method's own estimator."""

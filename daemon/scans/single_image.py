@@ -69,4 +69,5 @@ class SingleImageMethod(PatternMethod[SingleImage]):
             along=self.spec.along,
             reduce=self.spec.reduce,
             across=self.spec.axis,
+            stripe=self.spec.stripe,
         )

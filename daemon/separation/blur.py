@@ -33,6 +33,14 @@ def of_wave(sigma: float, period: float, weave: float = 0.0) -> float:
     return float(np.mean(np.abs(blurred_wave(sigma / period, weave))))
 
 
+def of_stripes(sigma: float, stripe: float) -> float:
+    """What a blur, above 0, leaves of the contrast of stripes in their middles; one unit."""
+    order = np.arange(16)
+    odd = 2 * order + 1
+    left = np.exp(-0.5 * np.square(odd * pi * sigma / stripe))
+    return float(4.0 / pi * np.sum((-1.0) ** order / odd * left))
+
+
 def blurred_wave(sigma: float, weave: float, shift: float = 0.0) -> NDArray[np.complex128]:
     """What a blur, in periods, leaves of exp(i weave sin(y + shift)) beside exp(ix), at 256 places
     of a period along y: of each of its harmonics along y, a Gaussian takes its own part."""

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation import light_model
 from daemon.separation.crossed import Cells, grey_of
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import Judgement, bits, finish
-from daemon.separation.full_light import FullLight, umbra
+from daemon.separation.full_light import PARTED, FullLight, Umbra
 from daemon.separation.gaps import Gaps
+from daemon.separation.levels import Levels, split_behind
 from daemon.separation.noise import Noise, TemporalNoise, noise_range
 from daemon.separation.order import Ranked
 from daemon.separation.radiometry import Plane, Response
@@ -30,6 +30,7 @@ DARKEST, BRIGHTEST = 4, 2
 _MISSED, _ONCE = 0.01, 0.25
 """Of the pixels: if more were never in the umbra, or in one frame only, it is said what to do."""
 
+_WHOLE = 0.9  # of the end of the scale
 _SAMPLE = 4  # noise is measured on every fourth row and column
 
 
@@ -39,8 +40,9 @@ class Occluder:
     L_max = L_d + g L_g and L_min = g L_g with g the part of the source that the occluder leaves
     (a stick: 1), b = 0 in the umbra. `planes["coverage"]` (uint16) counts the frames near a pixel's
     minimum, up to `DARKEST`; 0 where it was never unlit, or in penumbra only. `averaged` takes the
-    means of the samples in full light and in the umbra, without it the brightest and the darkest
-    (the paper's).
+    means of the samples in full light and in the umbra and states what noise leaves in them
+    (`planes` direct_std, global_std); without it the brightest and the darkest (the paper's), whose
+    error is a bias.
     """
 
     def __init__(self, response: Response, *, lit_fraction: float, averaged: bool = True) -> None:
@@ -55,6 +57,7 @@ class Occluder:
         self._low = Ranked(DARKEST, largest=False)
         self._high = Ranked(BRIGHTEST, largest=True)
         self._lit = FullLight()
+        self._umbra = Umbra()
         self._table: Plane | None = None  # deviation of a sample, by counts
         self._cells = Cells(self._response)
         self._gaps = Gaps()
@@ -88,6 +91,8 @@ class Occluder:
             if frames & (frames - 1) == 0 and (noise := self.noise()) is not None:
                 self._table = noise.deviation(np.arange(self._response.full_scale + 1))
             self._lit.add(told, self._high.planes[1], self._low.planes[0], self._table)
+            if self._averaged:
+                self._umbra.add(told, self._low.planes, self._table)
             self._sweeping.add(pixels)
             self._watch(pixels, observation.warp is not None)
 
@@ -105,7 +110,8 @@ class Occluder:
 
     def noise(self) -> Noise | None:
         """See `Extremes`."""
-        return self._noise.noise()
+        found = self._noise.noise()
+        return None if found is None else _by_brighter(found, self._response)
 
     def result(self) -> Components:
         """See `Estimator`. Raises NotYet before two frames are in."""
@@ -114,8 +120,8 @@ class Occluder:
             raise NotYet(f"an occluder's sweep needs 2 frames, {frames} came so far")
         low = self._response.linear(self._low.planes)
         high = self._response.linear(self._high.planes)
-        pixel_noise = self.noise()
-        deviation = self._response.deviation(pixel_noise, self._high.planes[0])
+        noise = self.noise()
+        deviation = self._response.deviation(noise, self._high.planes[0])
         crossed = self._cells.crossed(frames)
         seen = crossed.seen(low, high, deviation)
         never = crossed.never_unlit(seen, high[0], deviation)
@@ -123,27 +129,22 @@ class Occluder:
         coverage = _near_minimum(low, high, deviation)
         single = ~never & seen & (coverage == 1)
         coverage[never] = 0
-        brightest, darkest = high[0], low[0]
+        levels = self._levels(noise)
+        split = split_behind(levels, self._alpha, self._references, self._response, noise)
+        planes: dict[str, NDArray[Any]] = {"coverage": coverage}
         judged = Judgement.of_extremes(deviation, frames)
         if self._averaged:
-            brightest = self._response.linear_between(
-                self._lit.level(self._high.planes[1], self._low.planes[0], self._table)
-            )
-            darkest = umbra(low, self._response.deviation(pixel_noise, self._low.planes[0]))
+            planes |= {"direct_std": split.direct_std, "global_std": split.global_std}
             judged = _judgement(deviation, frames)
-        ambient = self._references.mean(Lighting.AMBIENT)
-        if ambient is not None:
-            brightest, darkest = brightest - ambient, darkest - ambient
-        direct, indirect = light_model.from_extremes(brightest, darkest, self._alpha)
         swept, advice = self._sweeping.told()
         return finish(
-            direct,
-            indirect,
+            split.direct,
+            split.indirect,
             response=self._response,
             brightest=high[0],
             saturated=self._high.planes[0] >= self._response.saturated_from,
             flags=bits(never, Quality.NEVER_UNLIT) | bits(single, Quality.SINGLE),
-            planes={"coverage": coverage},
+            planes=planes,
             judgement=judged,
             facts={
                 "estimator": "plateau" if self._averaged else "maxmin",
@@ -153,9 +154,21 @@ class Occluder:
                 "leakage": 0.0,
                 **swept,
                 "advice": [*advice, *_sparse(never, single)],
-                **self._references.facts("ambient frame" if ambient is not None else "none"),
+                **self._references.facts(split.source),
             },
         )
+
+    def _levels(self, noise: Noise | None) -> Levels:
+        """The light in full light and in the umbra: means, or the extremes."""
+        brightest, darkest = self._high.planes[0], self._low.planes[0]
+        told = np.ones(darkest.shape[:2], np.float32)
+        if not self._averaged:
+            one = np.ones(darkest.shape, np.uint16)
+            return Levels.of_counts(self._response, noise, (brightest, one), (darkest, one), told)
+        table = None if noise is None else noise.deviation(np.arange(self._response.full_scale + 1))
+        bright = self._lit.level(self._high.planes[1], darkest, self._table)
+        dark = self._umbra.level(self._low.planes, bright[0], table)
+        return Levels.of_counts(self._response, noise, bright, dark, told)
 
     def summary(self) -> dict[str, float]:
         """Frames, those not used, the part of the picture that the shadow has crossed, and the
@@ -177,7 +190,7 @@ def _near_minimum(low: Plane, high: Plane, deviation: Plane) -> NDArray[np.uint1
     noise = grey_of(deviation) * np.float32(1.0 if low.ndim == 3 else 3.0**-0.5)
     darkest = grey_of(low[0])
     tolerance = np.maximum(
-        np.float32(2.0 * 2.0**0.5) * noise, np.float32(0.1) * (grey_of(high[0]) - darkest)
+        np.float32(PARTED) * noise, np.float32(0.1) * (grey_of(high[0]) - darkest)
     )
     near = [grey_of(plane) - darkest <= tolerance for plane in low]
     return np.asarray(np.count_nonzero(near, axis=0), dtype=np.uint16)
@@ -192,6 +205,19 @@ def _sparse(never: NDArray[np.bool_], single: NDArray[np.bool_]) -> list[str]:
         f"{missed:.1%} of the pixels were never in the stick's full shadow, and {once:.1%} in a "
         "single frame: sweep again, more slowly, or with a wider stick, and over all of the scene"
     ]
+
+
+def _by_brighter(noise: Noise, response: Response) -> Noise:
+    """No level's light has more noise than that of brighter ones. In a fast sweep hardly a pixel of
+    the umbra stays there, and what it changes by is not noise."""
+    levels = np.asarray(noise.levels, dtype=np.float32)
+    slope = response.slope(levels)
+    light = np.asarray(noise.deviations, dtype=np.float32) * slope
+    whole = levels < _WHOLE * response.saturated_from  # beyond, noise is cut off
+    if not whole.any():
+        return noise
+    light[whole] = np.minimum.accumulate(light[whole][::-1])[::-1]
+    return Noise(noise.levels, tuple(float(x) for x in light / slope))
 
 
 def _judgement(deviation: Plane, frames: int) -> Judgement:

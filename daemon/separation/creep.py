@@ -31,7 +31,7 @@ Double = NDArray[np.float64]
 _WINDOW = 48  # pixels across that are looked at ...
 _ACROSS = 8  # ... at so many places each way
 _BLOCK = 16  # pixels across that have a brightness of their own
-_MARGIN = 8  # of a window, which a motion takes from elsewhere
+_MARGIN = 8  # of a window, which a motion or a blur takes from elsewhere
 _SMOOTH = 1.0  # pixels: slopes of single pixels are noise
 _GROUPS = 6
 _FEWEST = 2  # patterns whose sum tells texture from pattern
@@ -305,7 +305,8 @@ def _apart(components: Components, px: float) -> Plane:
 
 
 def _smooth(windows: NDArray[Any]) -> Plane:
-    blurred = [cv2.GaussianBlur(w.astype(np.float32), (0, 0), _SMOOTH) for w in windows]
+    stacked = windows.astype(np.float32).reshape(-1, windows.shape[2])  # margins keep them apart
+    blurred = cv2.GaussianBlur(stacked, (0, 0), _SMOOTH)
     return np.asarray(blurred, dtype=np.float32).reshape(windows.shape)
 
 

@@ -24,7 +24,7 @@ from daemon.separation.order import Ranked
 from daemon.separation.order_estimate import LEAST_FOR_BLUR, Estimated, OrderStatistics
 from daemon.separation.radiometry import FrameMean, Plane, Response
 from daemon.separation.references import References
-from daemon.separation.residue import NOT_SHIFTS, Mirrors, of_shifts
+from daemon.separation.residue import NOT_SHIFTS, Mirrors, in_order, misfit_of, of_shifts
 from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import HALF, compare
 from daemon.separation.uneven import Uneven, unevenness
@@ -78,6 +78,7 @@ class Extremes:
         self._waves = None if weights is None else WaveSums(weights)
         self._order = None if levels is None else OrderStatistics(levels, response, average, shifts)
         self._shifted = shifts is not None
+        self._ordered = shifts is None  # as far as is known
         self._references = References(response)
         self._noise = ScanNoise(response, average)
         self._mean = FrameMean(response) if average > 1 else None
@@ -131,14 +132,23 @@ class Extremes:
                 self._waves = None
 
     def _told(self) -> Told:
-        return self._noise.told() if self._order is None else self._order.told(self._noise)
+        if self._order is None:
+            return self._noise.told()
+        return self._order.told(self._noise, ordered=self._ordered)
 
     def _mirrored(self) -> Mirrors:
-        """Where the pattern came by way of a mirror, by what is known of noise."""
-        told = self._told()
+        """Where the pattern came by way of a mirror, by what is known of noise; and whether shifts
+        came in their order, so that what they have not in common is noise."""
+        misfit = None
+        if self._shifted:
+            misfit = misfit_of(self._waves, self._deviation(self._noise.told()))
+            self._ordered = in_order(misfit)
+        return of_shifts(self._waves, self._deviation(self._told()), misfit)
+
+    def _deviation(self, told: Told) -> Plane:
         ends = (self._light(ranked.planes[-1]) for ranked in (self._low, self._high))
         squares = (np.square(told.deviation(end)) for end in ends)
-        return of_shifts(self._waves, np.sqrt(sum(squares) * np.float32(0.5)))
+        return np.asarray(np.sqrt(sum(squares) * np.float32(0.5)))
 
     def result(self) -> Components:
         """See `Estimator`. Raises NotYet before two patterns are in; with fewer than two for each
@@ -189,7 +199,7 @@ class Extremes:
         saturated = self._saturated
         if saturated is None:
             saturated = self._high.planes[0] >= self._response.saturated_from
-        mirrors = self._mirrors or of_shifts(None, deviation)
+        mirrors = self._mirrors or of_shifts(None, deviation, None)
         if mirrors.mask is not None:
             mirror = bits(mirrors.mask, Quality.RESIDUE)
             flags = mirror if flags is None else flags | mirror
@@ -248,9 +258,13 @@ class Extremes:
         )
 
     def _variances(self, found: Estimated, told: Told) -> tuple[Plane, Plane]:
-        """Of direct and of global light: of noise, that of the references included."""
+        """Of direct and of global light: of noise, that of the references included, and of the
+        rounding of counts that all samples share."""
         g = light_model.global_weight(self._alpha, self._leakage)
         direct, indirect = found.variances(self._leakage, g)
+        dark = told.rounding(found.unlit)
+        direct += (dark + told.rounding(found.lit)) * np.float32((1.0 - self._leakage) ** -2)
+        indirect += dark * np.float32(g**-2)
         reference = self._references.ambient_variance(told)
         if reference is not None:
             indirect += reference * np.float32(g**-2)

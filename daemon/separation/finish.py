@@ -27,8 +27,7 @@ ADVICE: dict[Quality, tuple[float, str]] = {
     Quality.SATURATED: (
         0.005,
         "of the pixels are saturated, and their components too small: expose more briefly "
-        "(of a scan: --exposure), lower the gain, or bracket exposures of patterns "
-        "(--bracket 0.25,1)",
+        "(of a scan: --exposure), or lower the gain",
     ),
     Quality.NEGATIVE: (
         0.02,

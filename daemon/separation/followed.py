@@ -28,7 +28,7 @@ _RUN = 8  # neighbours in a row, where patterns have no order
 _MATRICES = {True: 1024, False: 384}  # that are looked at, with a grid of shifts and without
 _LEAST = 32  # of them, to say anything
 _DIM = 0.2  # of the brightest pixels' step: with less, a pixel is not looked at
-_SURPLUS = 3.5  # times the variance expected from which a matrix holds more than noise
+_SURPLUS = 3.5  # times the variance expected from which a matrix, or a frame, holds more than noise
 _FLOOR = 0.03  # of a matrix's mean variance, the least that a sample of it has
 _ROUNDS = 4  # of fitting, each without the matrices that the last found too noisy
 _LEVELS = 65  # that the noise is given at
@@ -114,12 +114,13 @@ def _places(shape: tuple[int, ...], run: int, mosaic: bool) -> NDArray[np.intp]:
     return np.asarray((first[:, None] + apart * np.arange(run)).reshape(-1))
 
 
-def _noise(matrices: Double, response: Response, average: int, rank: int | None) -> Noise:
+def _noise(matrices: Double, response: Response, average: int, rank: int | None) -> Noise | None:
     """The noise in what is left of matrices of light (n, rows, columns) without the means of their
     rows and `rank` components (None: those that are told from noise).
 
     Its variance is fitted as a constant, a part proportional to light (a sensor's) and, behind a
     tone curve, one proportional to the square of the curve's slope (of what comes after it).
+    None: it is not noise alone.
     """
     columns = matrices.shape[2]
     light = matrices - matrices.mean(axis=2, keepdims=True)
@@ -132,6 +133,9 @@ def _noise(matrices: Double, response: Response, average: int, rank: int | None)
     across = np.square(left @ left.transpose(0, 2, 1))
     down = np.eye(columns) - 1.0 / columns - along.transpose(0, 2, 1) @ along
     np.square(down, out=down)
+    of_frames = np.square(residual).mean(axis=0)
+    if rank is not None and of_frames.max() > _SURPLUS * np.median(of_frames):
+        return None  # a frame is not of its place: noise is alike in all
     level = matrices - residual
     basis = [np.ones_like(level), level]
     if not response.is_linear:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.separation.compression import COMPRESSED, in_blocks
 from daemon.separation.creep import Creep, marked
 from daemon.separation.estimator import Components, Estimator, Lighting, Observation, Result
 from daemon.separation.mosaic import orders_of
@@ -126,6 +127,7 @@ class FrameSet:
         self._steps: dict[tuple[int, int], float] = {}  # differences of frames in a row
         self._ceiling = Ceiling()
         self._mosaic: tuple[str, ...] | None = None  # that the first frame looks like
+        self._compressed: bool | None = None  # what it looks like
 
     def add(self, pixels: NDArray[Any], observation: Observation) -> None:
         """Take in a frame that is used."""
@@ -134,6 +136,7 @@ class FrameSet:
         self._ceiling.add(sample)
         if self._mosaic is None and observation.lighting in _BRIGHT:
             self._mosaic = orders_of(pixels[:_LOOK, :_LOOK]) if pixels.ndim == 2 else ()
+            self._compressed = in_blocks(pixels)
         light = self._response.linear(sample)
         level = float(light.mean(dtype=np.float64))
         if observation.lighting is not Lighting.PATTERN:
@@ -168,7 +171,9 @@ class FrameSet:
                 f"{other}: say so (--bayer)"
             )
         last = [] if self._references else [UNCHECKED]
-        facts: dict[str, Any] = {}
+        if self._compressed:
+            lines.append(COMPRESSED)
+        facts: dict[str, Any] = {"compressed": bool(self._compressed)}
         if self._even and len(self._levels) >= 2:
             order = sorted(self._levels)
             levels = np.array([self._levels[n].value for n in order])

@@ -20,6 +20,13 @@ two of penumbra among many ..."""
 LIT_DEVIATIONS = 5.0
 """... or that noise may have made so."""
 
+PARTED = 2.0 * 2.0**0.5
+"""Deviations by which noise parts two samples of one level."""
+
+_WORTH = 1.25**-2
+"""What a sample of many in the umbra is worth of others: which of them noise lets in differs (see
+`plateau.MEMBERS`)."""
+
 _LIMITED = 8
 """Frames after which it is asked again what is lit."""
 
@@ -59,11 +66,15 @@ class FullLight:
         self._count += lit
         self._frames += 1
 
-    def level(self, edge: NDArray[Any], darkest: NDArray[Any], table: Plane | None) -> Plane:
-        """The mean, float32 counts: the second brightest sample where none was lit."""
+    def level(
+        self, edge: NDArray[Any], darkest: NDArray[Any], table: Plane | None
+    ) -> tuple[Plane, NDArray[np.uint16]]:
+        """The mean, float32 counts, and of how many: the second brightest sample where none was
+        lit."""
         mean = self._sum / np.maximum(self._count, 1).astype(np.float32)
         behind = (self._count == 0) | (mean < _least_lit(edge, darkest, table))
-        return np.where(behind, edge, mean).astype(np.float32)
+        level = np.where(behind, edge, mean).astype(np.float32)
+        return level, np.where(behind, np.uint16(1), self._count)
 
 
 def _least_lit(edge: NDArray[Any], darkest: NDArray[Any], table: Plane | None) -> NDArray[Any]:
@@ -76,7 +87,57 @@ def _least_lit(edge: NDArray[Any], darkest: NDArray[Any], table: Plane | None) -
     return least
 
 
-def umbra(low: Plane, deviation: Plane) -> Plane:
-    """The mean of the kept darkest samples (n, ...) that noise alone may part from the darkest."""
-    near = low - low[0] <= np.float32(2.0 * 2.0**0.5) * deviation
-    return np.asarray(np.sum(low * near, axis=0) / np.count_nonzero(near, axis=0), np.float32)
+class Umbra:
+    """The mean of a pixel's samples that noise alone may part from the second darkest: two planes.
+
+    It begins again, with the two darkest, when it is further off than that itself: what came before
+    was lit.
+    """
+
+    def __init__(self) -> None:
+        self._sum = np.zeros(0, np.uint32)
+        self._count = np.zeros(0, np.uint16)
+
+    def add(self, samples: NDArray[Any], darkest: NDArray[Any], table: Plane | None) -> None:
+        """Take in a frame; `darkest` are the darkest samples of each pixel, two or more, this
+        frame's among them; `table` as in `FullLight`."""
+        if not self._count.size:
+            self._sum = samples.astype(np.uint32)
+            self._count = np.ones(samples.shape, np.uint16)
+            return
+        most = _most_dark(darkest[1], table)
+        dark = (samples <= most) & (self._count < _MOST)
+        self._sum += samples * dark
+        self._count += dark
+        left = self._sum > self._count * most.astype(np.uint32)
+        if left.any():
+            self._sum[left] = darkest[0][left].astype(np.uint32) + darkest[1][left]
+            self._count[left] = 2
+
+    def level(
+        self, kept: NDArray[Any], lit: Plane, table: Plane | None
+    ) -> tuple[Plane, NDArray[np.uint16]]:
+        """The mean, float32 counts, and how many samples it is worth.
+
+        `kept` are the darkest samples, in order, `lit` the level in full light. Those that noise
+        alone may part from the darkest are the umbra's. Where they all are, there may be more, and
+        the mean is of those, unless noise may take lit ones for them.
+        """
+        near = kept <= _most_dark(kept[0], table)
+        count = np.count_nonzero(near, axis=0).astype(np.uint16)
+        few = np.sum(kept * near, axis=0, dtype=np.float32) / count
+        apart = _most_dark(_most_dark(kept[1], table), table) < lit
+        many = (count == len(kept)) & (self._count > count) & apart
+        mean = self._sum / self._count.astype(np.float32)
+        level = np.where(many, mean, few).astype(np.float32)
+        worth = (self._count * _WORTH).astype(np.uint16)
+        return level, np.where(many, np.maximum(worth, count), count)
+
+
+def _most_dark(darkest: NDArray[Any], table: Plane | None) -> NDArray[Any]:
+    """The largest sample of each pixel that noise alone may part from `darkest`."""
+    if table is None:
+        return darkest
+    every = np.arange(table.size)
+    most = np.minimum(every + PARTED * table, table.size - 1).astype(darkest.dtype)
+    return np.take(most, darkest)

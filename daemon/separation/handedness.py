@@ -111,8 +111,9 @@ def _duals(offsets: list[int], period: float) -> dict[int, complex] | None:
 
 
 def strength(waves: Sequence[Wave], deviation: Plane) -> Plane:
-    """The weakest wave's amplitude over its noise, whose deviation is of a frame's shape."""
-    noise = deviation if deviation.ndim == 2 else np.sqrt(np.square(deviation).sum(axis=2))
+    """The weakest wave's amplitude over its noise, whose deviation is of a frame's shape. Colours
+    may share theirs: interpolated from one mosaic, or compressed as one picture."""
+    noise = deviation if deviation.ndim == 2 else deviation.sum(axis=2)
     weakest = np.minimum.reduce([np.abs(wave) for wave in waves])
     return np.asarray(weakest / np.maximum(noise, np.float32(1e-6)), dtype=np.float32)
 

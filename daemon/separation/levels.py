@@ -4,6 +4,7 @@ known, and direct and global from both (§4.2)."""
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,27 @@ class Levels:
     unlit: NDArray[np.uint16]
     told: Plane
 
+    @classmethod
+    def of_counts(
+        cls,
+        response: Response,
+        noise: Noise | None,
+        high: tuple[NDArray[Any], NDArray[np.uint16]],
+        low: tuple[NDArray[Any], NDArray[np.uint16]],
+        told: Plane,
+        scatter: float = 1.0,
+    ) -> Levels:
+        """From the encoded counts of both levels and of how many samples each is a mean; `scatter`
+        is its deviation over that of any so many samples' mean."""
+        (bright, bright_std), (dark, dark_std) = (
+            (
+                response.linear_between(level.astype(np.float32)),
+                response.deviation(noise, level) * np.sqrt(scatter**2 / count, dtype=np.float32),
+            )
+            for level, count in (high, low)
+        )
+        return cls(bright, dark, bright_std, dark_std, high[1], low[1], told)
+
     def of(self, part: Part) -> Levels:
         """Of a part of the picture."""
         return Levels(*(getattr(self, field.name)[part] for field in fields(self)))
@@ -47,10 +69,10 @@ class Split:
     source: str
 
 
-def split_by_mesh(
-    levels: Levels, beta: float, references: References, response: Response, noise: Noise | None
+def split_behind(
+    levels: Levels, part: float, references: References, response: Response, noise: Noise | None
 ) -> Split:
-    """Components behind a mesh of hole fraction β.
+    """Components behind an occluder that lets a part of the source pass: a mesh's β, a stick's α.
 
     With no reference frames light that is not the source's is taken for none. An ambient frame says
     how much it is; an open frame (no mesh) tells it apart; with both, what is in the open neither
@@ -70,16 +92,16 @@ def split_by_mesh(
     nothing = np.zeros_like(direct), np.zeros_like(direct)
     off, whole = known(Lighting.AMBIENT), known(Lighting.OPEN)
     ambient, ambient_std = off or nothing
-    passed = np.float32(1.0 / beta)
-    indirect = (levels.dark - ambient) * passed
-    global_std = np.hypot(levels.dark_std, ambient_std) * passed
+    weight = np.float32(1.0 / part)
+    indirect = (levels.dark - ambient) * weight
+    global_std = np.hypot(levels.dark_std, ambient_std) * weight
     source = "none" if off is None else "ambient frame"
     clipped = references.open_saturated
     if whole is None or clipped is None:
         return Split(direct, indirect, direct_std, global_std, ambient, source)
     if off is None:
-        _, told, other = light_model.from_mesh_and_open(levels.bright, levels.dark, whole[0], beta)
-        told_std = np.hypot(whole[1], levels.bright_std) * np.float32(1.0 / (1.0 - beta))
+        _, told, other = light_model.from_mesh_and_open(levels.bright, levels.dark, whole[0], part)
+        told_std = np.hypot(whole[1], levels.bright_std) * np.float32(1.0 / (1.0 - part))
         source = "open frame"
     else:
         told, other = whole[0] - ambient - direct, ambient

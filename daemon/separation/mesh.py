@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.islands import LEAST_MODULATION, coverage, coverage_of_mosaic
-from daemon.separation.levels import Levels, split_by_mesh
+from daemon.separation.levels import Levels, split_behind
 from daemon.separation.noise import Noise
 from daemon.separation.pitch import pitch_px
 from daemon.separation.plateau import BAND, MEMBERS, NEAR, WHOLE, Part, Plateaus, noise_at
@@ -38,7 +38,7 @@ class MeshOccluder:
     """Frames of a scene behind a moving mesh -> direct, global, coverage.
 
     `hole_fraction` is β; None: it is measured, by the part of the time that places are lit. With an
-    open frame (no mesh) ambient light and global are told apart pixel by pixel (`split_by_mesh`).
+    open frame (no mesh) ambient light and global are told apart pixel by pixel (`split_behind`).
     `averaged` takes the mean of all samples in full light and in the umbra and states what noise
     leaves in it (`planes` direct_std, global_std); without it the single brightest and darkest (the
     paper's) are taken, whose error is a bias. `planes["coverage"]` (uint16) counts the frames in
@@ -140,7 +140,7 @@ class MeshOccluder:
         levels = self._levels(noise, WHOLE)
         one = self._response.deviation(noise, self._plateaus.high.extreme)
         beta = self._beta or self._lit_of_the_time(levels)
-        split = split_by_mesh(levels, beta, self._references, self._response, noise)
+        split = split_behind(levels, beta, self._references, self._response, noise)
         known = split.source != "none"
         pull = self._pull(noise, levels, split.other) if self._averaged else {}
         pitch = self._pitch(beta)
@@ -196,12 +196,7 @@ class MeshOccluder:
         told = (1.0 - missed / max(self._plateaus.frames, 1)).astype(np.float32)
         if not self._averaged:
             high, low = brightest, darkest
-        bright, dark = (self._response.linear_between(x.astype(np.float32)) for x in (high, low))
-        bright_std, dark_std = (
-            self._response.deviation(noise, x) * np.sqrt(MEMBERS**2 / on, dtype=np.float32)
-            for x, on in ((high, lit), (low, unlit))
-        )
-        return Levels(bright, dark, bright_std, dark_std, lit, unlit, told)
+        return Levels.of_counts(self._response, noise, (high, lit), (low, unlit), told, MEMBERS)
 
     def _pull(self, noise: Noise | None, levels: Levels, other: Plane) -> dict[str, float]:
         """How far, at most, what is averaged pulls the levels together: medians of what that takes
@@ -284,9 +279,10 @@ def _advice(beta: float | None, pull: dict[str, float]) -> list[str]:
     lines = []
     if beta is not None:
         lines.append(
-            f"light that is not the source's (sky, room), if any, counts {1.0 / beta:.2g} times in "
-            "global: a frame with the source off takes it out (of a scan: --references ambient; of "
-            "a recording: --ambient-frame, or --open-frame for one without the mesh)"
+            f"light that is not the source's (sky, room) or reaches the scene past the mesh, if "
+            f"any, counts {1.0 / beta:.2g} times in global: a frame with the source off takes out "
+            "the first (of a scan: --references ambient; of a recording: --ambient-frame), with "
+            "one without the mesh (--open-frame) both"
         )
     if pull.get("direct", 0.0) > _PULLED:
         lines.append(

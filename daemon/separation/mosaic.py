@@ -89,7 +89,8 @@ class Mosaic:
         around /= np.maximum(_around(there, _NEXT) - there, np.float32(1))
         noise = self._there(noise)
         level = np.maximum(np.abs(around), _DARK * noise)
-        np.maximum(level, np.float32(1e-6) * level.max(), out=level)
+        least = np.float32(1e-6) * level.max()  # 0 where no sample is known
+        np.maximum(level, least if least > 0 else np.float32(1), out=level)
         texture = np.square((values - around) * there)
         texture -= np.float32(1 + 1 / 8) * np.square(noise)
         texture /= np.square(level)

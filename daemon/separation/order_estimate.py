@@ -81,9 +81,9 @@ class OrderStatistics:
     def _noise(self) -> Noise | None:
         return self._followed.noise(self._followed.light(), self._average)
 
-    def told(self, noise: ScanNoise) -> Told:
-        """What is known of the noise by now."""
-        return noise.told(self._residual or self._noise())
+    def told(self, noise: ScanNoise, *, ordered: bool) -> Told:
+        """What is known of the noise by now; `ordered`: patterns came in their order, if any."""
+        return noise.told(self._residual or self._noise(), ordered=ordered)
 
     def of_two_levels(self, told: Told) -> bool:
         """Whether the samples followed can be lit and unlit ones: under patterns of many levels

@@ -28,8 +28,9 @@ NEAR = 0.05
 whatever the noise: where things stand close together the rest of the scene's light goes up and down
 by about as much. The frames of penumbra that are within it are few."""
 
-ALONE = 1.5
-"""A sample that is so many widths of the band beyond the mean is not of it."""
+ALONE = 2.0
+"""A sample that is so many widths of the band beyond the mean, or the second most extreme one, is
+not of them: less, and a pixel that was twice there would count as covered once."""
 
 MEMBERS = 1.25
 """Deviation of such a mean over that of one of as many samples: which of them are within the band
@@ -124,7 +125,7 @@ class _End:
         """Begin the mean again, with the two most extreme samples, or the second where the first
         stands alone."""
         first, edge = first[left], edge[left]
-        alone = (first - edge) * self._sign > width[left]
+        alone = (first - edge) * self._sign > np.float32(ALONE) * width[left]
         self._sum[part][left] = np.where(alone, edge, edge + first)
         self._count[part][left] = np.where(alone, 1, _KEPT)
 

@@ -9,7 +9,9 @@ so that the source's strength does not matter. That tells the place to a quarter
 better, because what is left of the shadow pulls; from there `placing.Levels` finds the rest, and
 the turn.
 
-The first frames are the reference: they are aligned among themselves once they are all there.
+The first frames are the reference: they are aligned among themselves once they are all there, by
+their correlation first, then round by round with the levels that they make, turns too. An exact
+place that lies nowhere near the correlation's is not believed.
 """
 
 from __future__ import annotations
@@ -45,7 +47,9 @@ Warp = tuple[float, float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 
 _WORK = 320  # longer side of the pictures that are compared
-_LEAST_SIDE = 64  # small pixels of the longer side
+_LEAST_SIDE = (
+    120  # small pixels of the longer side: in smaller ones a shift out of reach passed for another
+)
 _FLOOR = 0.03  # of the bright places: added to light, so that the dark ones' noise has no say
 _FOLLOWED = 0.25  # of the differences: only a mesh that was taken for the scene explains so much
 _SOFT = 0.5  # px: finer things interpolation moves by another way
@@ -143,9 +147,13 @@ class Registration:
     @property
     def tells(self) -> bool:
         """Whether the scene has texture enough for places to be known."""
+        return self._seen and self.sd < UNSURE_PX and self._astray < _MANY_ASTRAY
+
+    @property
+    def _seen(self) -> bool:
+        """Whether the correlation sees the scene, and not the mesh."""
         followed = self._mesh and self._explained > _FOLLOWED
-        known = max(self.sd, self._coarse_sd) < UNSURE_PX and self._astray < _MANY_ASTRAY
-        return known and not followed
+        return self._coarse_sd < UNSURE_PX and not followed
 
     def learn(self, pixels: NDArray[Any]) -> None:
         """Take in a frame for the reference; the last of `REFERENCE` ones makes it."""
@@ -265,7 +273,6 @@ class Registration:
             change = np.abs(shifts - before).max() * self._factor
             if shortest == 1 and change < _SETTLED:
                 break
-        motions = self._place_first([shifted(*d) for d in shifts])
         moved = [self._moved(s, *d) for s, d in zip(spectra, shifts, strict=True)]
         mean = np.mean(moved, axis=0)
         shadow = np.mean([np.abs(s - mean) ** 2 for s in moved], axis=0) * count / (count - 1)
@@ -278,6 +285,7 @@ class Registration:
             self._coarse_sd = self._factor * math.sqrt(float(np.trace(np.linalg.inv(curvature))))
         unaligned = np.mean([np.abs(s - np.mean(spectra, axis=0)) ** 2 for s in spectra], 0)
         self._explained = 1.0 - _both(shadow) / max(_both(unaligned), 1e-9)
+        motions = self._place_first([shifted(*d) for d in shifts])
         self.wandered = max(self._place(motion, True).px for motion in motions)
 
     def _place_first(self, motions: list[Motion]) -> list[Motion]:
@@ -285,6 +293,8 @@ class Registration:
         about so, and see how well two halves of the picture agree about these. Their motions."""
         levels = self._levels = Levels.guessed(self._first, motions)
         sure = [True] * len(motions)
+        if not self._seen:
+            return motions
         for _ in range(_REFINED):
             levels = self._levels = levels.gathered(
                 list(compress(self._first, sure)), list(compress(motions, sure))

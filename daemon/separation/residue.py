@@ -55,8 +55,22 @@ class Mirrors:
     as_declared: bool = True
 
 
-def of_shifts(sums: WaveSums | None, deviation: Plane) -> Mirrors:
-    """`mirrored` of a scan's sums, `deviation` that of a sample.
+def misfit_of(sums: WaveSums | None, deviation: Plane) -> float | None:
+    """`handedness.imbalance` of a checkerboard's sums; None where they do not tell. `deviation`: a
+    sample's by noise alone, and not by frames that are of other shifts."""
+    waves = None if sums is None else sums.waves()
+    if sums is None or waves is None:
+        return None
+    return imbalance(waves, strength(waves, deviation * np.float32(sums.gain)))
+
+
+def in_order(misfit: float | None) -> bool:
+    """Whether frames with such a misfit are a checkerboard's shifts."""
+    return misfit is not None and misfit <= _UNLIKE
+
+
+def of_shifts(sums: WaveSums | None, deviation: Plane, unlike: float | None) -> Mirrors:
+    """`mirrored` of a scan's sums, `deviation` that of a sample, `unlike` the sums' misfit.
 
     Two waves are a checkerboard's x + y and x - y, one wave that of random patches, of which
     nothing tells the order.
@@ -67,9 +81,8 @@ def of_shifts(sums: WaveSums | None, deviation: Plane) -> Mirrors:
     strong = strength(waves, deviation * np.float32(sums.gain))
     if len(waves) == 1:
         return Mirrors(*mirrored(waves, strong, turning=False, smooth=False))
-    unlike = imbalance(waves, strong)
     misfit = {"pattern_misfit": None if unlike is None else round(unlike, 4)}
-    if unlike is not None and unlike > _UNLIKE:
+    if unlike is not None and not in_order(unlike):
         return Mirrors(None, {"mirrors_looked_for": False, **misfit}, as_declared=False)
     mask, facts = mirrored(waves, strong, turning=True, smooth=True)
     return Mirrors(mask, {**facts, **misfit})

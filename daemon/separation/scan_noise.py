@@ -77,14 +77,16 @@ class ScanNoise:
     def _picture(self) -> Noise | None:
         return None if self._pattern is None else self._bounds.of(self._pattern)
 
-    def told(self, residual: Noise | None = None) -> Told:
+    def told(self, residual: Noise | None = None, *, ordered: bool = False) -> Told:
         """What is known by now; `residual`: the noise of one frame in what the light that patterns
-        have in common leaves over (`Followed`).
+        have in common leaves over (`Followed`); `ordered`: they have it, as other signs say.
 
-        A calibration is believed unless the scan's own frames contradict it.
+        A picture shows no less noise than there is, unless files were compressed: that takes noise
+        away where a picture is smooth, and adds error where it has a pattern. A calibration is
+        believed unless the scan's own frames contradict it.
         """
         picture = self._picture
-        if residual is not None and picture is not None and residual.over(picture) > _MORE:
+        if residual and picture and not ordered and residual.over(picture) > _MORE:
             residual = None  # the light has not the order that it was said to have
         for found, source in ((self._repeats.noise(), REPEATS), (residual, RESIDUALS)):
             if found is not None:
@@ -97,6 +99,7 @@ REPEATS, PICTURE = "repeated frames", "one picture"
 RESIDUALS, CALIBRATION = "residuals of the fit", "calibration"
 
 _SURE, _UNSURE = 1.25, 1.5
+_ROUNDED = 1.0 / 12.0  # variance of a count's rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +127,19 @@ class Told:
         if self.average > 1:
             one *= np.float32(self.average**-0.5)
         return one
+
+    def rounding(self, light: Plane) -> Plane:
+        """Variance of linear light at a level of it that averaging leaves (float32): counts are
+        rounded alike in all frames where noise is less than about half a count (Widrow; the first
+        harmonic of the error that Gaussian noise dithers)."""
+        if self.response.noise_from is not None:  # merged exposures are no whole counts
+            return np.zeros_like(light)
+        counts = self.response.counts(light)
+        slope = self.response.slope(counts)
+        one = self.response.deviation(self.noise, counts) / np.maximum(slope, np.float32(1e-9))
+        own = np.maximum(np.square(one) - np.float32(_ROUNDED), 0.0)
+        alike = np.float32(_ROUNDED) * np.exp(np.float32(-4.0 * np.pi**2) * own)
+        return np.asarray(alike * np.square(slope), dtype=np.float32)
 
     def wave_deviations(self, mean: Plane, amplitude: Plane) -> tuple[Plane, Plane]:
         """Those of linear light over the phases of a sinusoid, as its mean and as its wave meet

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation import light_model
+from daemon.separation.blur import of_stripes
+from daemon.separation.deviation import stated
 from daemon.separation.envelope import block_mean, envelope
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
 from daemon.separation.fineness import astray
@@ -27,6 +30,7 @@ _PIECE = 64  # pixels of a row, whose frequency is looked for
 _CLEAR = 8.0  # times the power of other frequencies
 _FAINT = 4.0  # deviations of white: a step of so many counts for half
 _BEYOND = np.float32(0.25)  # of the step: noise takes no level further
+_UNSURE, _TYPICAL = 0.5, 1.0  # of what so many projector px of blur take: it is not known
 _LIT, _UNLIT = 0.8, 0.3  # typical levels of peaks and valleys
 _PEAK = 0.82 * 0.9
 """Deviation of a row's peaks in a square over a pixel's: a peak is the larger of two pixels as
@@ -40,7 +44,9 @@ class PeaksAndValleys:
     A pixel is a peak (valley) when it is the brightest (darkest) of `window` pixels across the
     stripes by `along` pixels along them. Light between peaks is interpolated across the stripes and
     averaged over `reduce` x `reduce` pixels; likewise between valleys; then Eq. 8. Each colour of a
-    mosaic is a picture of its own, of half the size. Planes: `direct_std`, `global_std`.
+    mosaic is a picture of its own, of half the size. Planes: those of `deviation.stated`, with what
+    noise lifts peaks by and what blur may take from stripes of `stripe` projector pixels (None: not
+    known), which nothing tells.
 
     With a black and a white frame peaks are those of (I - K)/(W - K), in which texture is no light:
     (L_d + α L_g)/(L_d + L_g) where lit, α L_g/(L_d + L_g) where not, whatever the leakage.
@@ -58,6 +64,7 @@ class PeaksAndValleys:
         along: int = 1,
         reduce: int = 4,
         across: str = "x",
+        stripe: float | None = None,
     ) -> None:
         if response.bayer and reduce % 2:
             raise ValueError(
@@ -70,6 +77,7 @@ class PeaksAndValleys:
         self._along = along
         self._reduce = reduce
         self._across = across
+        self._blurred = 0.0 if stripe is None else _UNSURE * (1.0 - of_stripes(_TYPICAL, stripe))
         self._references = References(response)
         self._bounds = ReferenceNoise(response)
         self._mean = FrameMean(response)
@@ -136,7 +144,8 @@ class PeaksAndValleys:
                 np.sqrt(np.square(sd) + self._reduced(scale.variance(level, self._frames)))
                 for sd, level in ((most, _LIT), (least, _UNLIT))
             )
-        planes = self._stated(noise, most, least)
+        noises = self._noises(noise, most, least)
+        planes = stated(*noises, self._lifted(most, least), direct * np.float32(self._blurred))
         mirrored = self._mirrored(picture, noise)
         looked, advice = self._looked(picture, brightest, darkest)
         if scale is not None and (period := self._period(scale.levels(picture))) is not None:
@@ -246,8 +255,17 @@ class PeaksAndValleys:
         found = astray(wave, strong, self._across)
         return None if found is None else block_mean(found.astype(np.float32), self._reduce) > 0.5
 
-    def _stated(self, told: Told, most: Plane, least: Plane) -> dict[str, NDArray[Any]]:
-        """Deviations of the components from those of one pixel's peaks and valleys.
+    def _lifted(self, most: Plane, least: Plane) -> Plane:
+        """By how much noise makes direct light too large: a peak is the brightest of half of the
+        window's pixels, a valley the darkest of the others, and no mean takes that off."""
+        samples = max(self._window // (2 if self._response.bayer else 1) * self._along / 2, 1.0)
+        first = NormalDist().inv_cdf((samples - 0.375) / (samples + 0.25))  # Blom's place
+        by = np.float32(first / ((1.0 - self._leakage) * max(self._frames, 1) ** 0.5))
+        lifted: Plane = (most + least) * by
+        return lifted
+
+    def _noises(self, told: Told, most: Plane, least: Plane) -> tuple[Plane, Plane]:
+        """Deviations of the components by noise from those of one pixel's peaks and valleys.
 
         A peak is the largest of a few pixels as bright; it speaks for its row up to the next peak,
         so that a square of k x k averages k rows of about one peak each.
@@ -269,10 +287,9 @@ class PeaksAndValleys:
                 of_dark += np.square(noise) * (np.float32((1.0 - b) ** 2) / averaged)
                 break
         of_lit = np.square(high) * np.float32(b * b)
-        return {
-            "direct_std": np.hypot(high, low) * np.float32(1.0 / (1.0 - b)),
-            "global_std": np.sqrt(of_dark + of_lit) * np.float32(1.0 / ((1.0 - b) * g)),
-        }
+        of_direct: Plane = np.hypot(high, low) * np.float32(1.0 / (1.0 - b))
+        of_global: Plane = np.sqrt(of_dark + of_lit) * np.float32(1.0 / ((1.0 - b) * g))
+        return of_direct, of_global
 
     def _noise(self, picture: Plane) -> Told:
         """That of one of the frames that were averaged."""

@@ -8,6 +8,7 @@ whichever are missing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -37,9 +38,17 @@ _MISFIT = 5.0
 _DOUBTFUL = 2.0
 """Above this it is none where it is also a part of the wave: ..."""
 _DISTORTED = 0.05
+_REFUSED = 0.1  # of direct light: if it may be off by so much, all of it is flagged
 _BENT = 0.03  # of the wave: with more of it in its amplitude thrice a period, light was no sinusoid
 _ODD = 0.05  # with more of it in mean or amplitude once a period, frames are not of these phases
 _MANY = 0.1  # of the pixels
+
+_DIFFER = (
+    "the periods give different direct light in {:.0%} of the pixels: light is scattered or "
+    "reflected over less than a period there, and direct may be too large by about the stated "
+    "deviation (finer --periods tell), or the frames are not the phases and periods that were "
+    "declared (--phases, --periods)"
+)
 
 
 class LeastSquares:
@@ -124,9 +133,14 @@ class LeastSquares:
             quality |= bits(split.known, Quality.EDGE) | fade.flags
             between["edges"] = round(float(np.mean(split.known)), 4)
             faded = fade.advice
+        misfit, rippled = self._noise.misfit, self._ripple(ready, noise)
+        wrong, lines = _wrong(misfit, self._noise.distortion, rippled)
+        if wrong:
+            off.append(direct * np.float32(wrong))
+        if wrong > _REFUSED:
+            quality |= np.uint16(Quality.DISAGREE)
         planes = stated(*noises, *off)
         reflected, told = self._mirrored(ready[0], noise)
-        rippled = self._ripple(ready, noise)
         if reflected is not None:
             quality |= bits(reflected, Quality.RESIDUE)
         planes.update(self._correspondence(ready))
@@ -135,7 +149,6 @@ class LeastSquares:
         )
         if moved is not None:
             quality |= moved
-        misfit = self._noise.misfit
         disagreeing = float(np.mean(solved.disagree))
         facts: dict[str, Any] = {
             "estimator": "lsq",
@@ -154,7 +167,8 @@ class LeastSquares:
             "misfit": None if misfit is None else round(misfit, 3),
             "ripple": [[round(one.tone, 4), round(one.frames, 4)] for one in rippled],
             "advice": [
-                *_advice(misfit, self._noise.distortion, disagreeing, rippled),
+                *lines,
+                *([_DIFFER.format(disagreeing)] if disagreeing > _MANY else []),
                 *blur.advice(),
                 *faded,
                 *other_axis({n: planes[n] for n in ("column", "row") if n in planes}),
@@ -290,35 +304,34 @@ def _mean(fits: list[WaveFit]) -> Plane:
     return mean
 
 
-def _advice(
-    misfit: float | None, distortion: float | None, disagreeing: float, rippled: list[Ripple]
-) -> list[str]:
-    """What to do about frames that are no sinusoids in time; [] where they are."""
-    lines = []
+def _wrong(
+    misfit: float | None, distortion: float | None, rippled: list[Ripple]
+) -> tuple[float, list[str]]:
+    """How large a part of direct light both components may be off by where frames are no sinusoids
+    in time, and what to do about it; 0 and [] where they are."""
+    off, lines = 0.0, []
     if misfit is not None and (
         misfit > _MISFIT or (misfit > _DOUBTFUL and (distortion or 0.0) > _DISTORTED)
     ):
+        # A curve of the second order shifts the mean by as much as its harmonic's amplitude.
+        off = math.sqrt(2.0) * (distortion or 0.0)
         lines.append(
             f"the frames are {misfit:.0f} times further from a sinusoid than noise takes them: "
             "they are not the phases that were declared (--phases, --periods), the tone curve is "
-            "not linear, or something moved"
+            "not linear, or something moved: don't trust the components"
         )
     if (bent := max((one.tone for one in rippled), default=0.0)) > _BENT:
+        off = max(off, bent)
         lines.append(
             f"the wave's amplitude goes up and down three times a period, by {bent:.0%}: the "
             "projector's or the camera's tone curve is not linear (run `umbra calibrate tone`, or "
-            "give the camera's curve with --tone)"
+            "give the camera's curve with --tone): don't trust the components"
         )
     elif (odd := max((one.frames for one in rippled), default=0.0)) > _ODD:
+        off = max(off, odd)
         lines.append(
             f"the pattern itself shows in the components, by {odd:.0%} of the wave: the frames are "
-            "not thirds of a turn apart (--phases), or not of one exposure"
+            "not thirds of a turn apart (--phases), or not of one exposure: don't trust the "
+            "components"
         )
-    if disagreeing > _MANY:
-        lines.append(
-            f"the periods give different direct light in {disagreeing:.0%} of the pixels: light is "
-            "scattered or reflected over less than a period there, and direct may be too large by "
-            "about the stated deviation (finer --periods tell), or the frames are not the phases "
-            "and periods that were declared (--phases, --periods)"
-        )
-    return lines
+    return off, lines

@@ -58,6 +58,9 @@ class StillPlaces:
         change = now - before
         if not change.any():  # a copy, as in slowed-down videos
             return
+        low, high = np.minimum(now, before).min(axis=0), np.maximum(now, before).max(axis=0)
+        whole = (low > 0) & (high < self._response.saturated_from)  # else noise is cut off
+        now, before, change = now[:, whole], before[:, whole], change[:, whole]
         own, others = change[0], change[1:]
         light = self._response.linear_between((now[0] + before[0]) * np.float32(0.5))
         share = np.maximum(light, 0) * np.float32(1.0 / self._response.linear_full_scale)

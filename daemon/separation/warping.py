@@ -16,25 +16,15 @@ NOISES = 3.0
 """Interpolation that may change a sample by more deviations of its noise spoils it."""
 
 _SECOND = np.array([[1.0, -2.0, 1.0]], np.float32)
-_NEIGHBOURS = np.ones((3, 3), np.uint8)
 _ROUNDING = np.float32(12.0**-0.5)  # deviation of a count's rounding: noise that is not known
 
 
 def aligned(pixels: NDArray[Any], warp: tuple[float, ...], bayer: bool) -> NDArray[Any]:
-    """A frame moved by a warp to where the reference lies, same shape and dtype. A mosaic's four
-    kinds of pixels are moved each by itself. What lies outside the frame repeats its edge: see
-    `beyond`.
-
-    By Lanczos' kernel, which keeps edges sharp and in their places (a bilinear or a cubic one takes
-    fine things a few hundredths of a pixel astray); but no sample is brighter or darker than its
-    neighbours are.
-    """
+    """A frame moved by a warp to where the reference lies, same shape and dtype: bilinear, so that
+    no sample is brighter or darker than its neighbours. A mosaic's four kinds of pixels are moved
+    each by itself. What lies outside the frame repeats its edge: see `beyond`."""
     if not bayer:
-        matrix = np.asarray(warp, np.float64).reshape(2, 3)
-        moved = _moved(pixels, matrix, cv2.INTER_LANCZOS4)
-        least = _moved(cv2.erode(pixels, _NEIGHBOURS), matrix, cv2.INTER_NEAREST)
-        most = _moved(cv2.dilate(pixels, _NEIGHBOURS), matrix, cv2.INTER_NEAREST)
-        return np.clip(moved, least, most, out=moved)
+        return _warped(pixels, np.asarray(warp, np.float64).reshape(2, 3))
     out = np.empty_like(pixels)
     for part, inner in _quarters(warp):
         out[part] = aligned(np.ascontiguousarray(pixels[part]), inner, False)
@@ -131,12 +121,9 @@ def _quarters(warp: tuple[float, ...]) -> Iterator[tuple[tuple[slice, slice], tu
 
 
 def _warped(pixels: NDArray[Any], matrix: NDArray[np.float64]) -> NDArray[Any]:
-    """Bilinear, for what is not light."""
-    return _moved(pixels, matrix, cv2.INTER_LINEAR)
-
-
-def _moved(pixels: NDArray[Any], matrix: NDArray[np.float64], kernel: int) -> NDArray[Any]:
     size = (pixels.shape[1], pixels.shape[0])
     return np.asarray(
-        cv2.warpAffine(pixels, matrix, size, flags=kernel, borderMode=cv2.BORDER_REPLICATE)
+        cv2.warpAffine(
+            pixels, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
     )

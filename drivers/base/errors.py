@@ -30,6 +30,10 @@ class DeviceRefused(DeviceError):
     """It answered no: it did not act, and the same command will be refused again."""
 
 
+class OutOfRange(DeviceRefused):
+    """It was asked for a number that is beyond what it can do; nothing was sent."""
+
+
 class DeviceGarbled(DeviceError):
     """It answered something that makes no sense."""
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drivers.base.camera import Acquisition, Camera, CameraInfo, CameraSettings, Frame
 from drivers.base.device import Context, Identity, Options
-from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceRefused, DeviceTimeout, OutOfRange
 from drivers.clock import NS
 from drivers.virtual.cameraoptions import EXPOSURE_US, GAIN_DB, CameraOptions
 from drivers.virtual.device import VirtualDevice
@@ -125,17 +125,25 @@ class VirtualCamera(VirtualDevice, Camera):
             (new.frame_rate_hz, (0.01, 1e4), "frame rate in Hz"),
         ):
             if not low <= value <= high:
-                raise self._refuse(
-                    "configure", f"{what} {value:g}", f"choose one from {low:g} to {high:g}"
+                raise OutOfRange(
+                    self.name,
+                    "configure",
+                    f"{what} {value:g}",
+                    f"choose one from {low:g} to {high:g}",
                 )
         x, y, width, height = new.roi
         fits = x >= 0 and y >= 0 and x + width <= self._o.width and y + height <= self._o.height
         if not (fits and width > 0 and height > 0):
-            raise self._refuse(
-                "configure", f"roi {new.roi}", f"stay within {self._o.width} x {self._o.height}"
+            raise OutOfRange(
+                self.name,
+                "configure",
+                f"roi {new.roi}",
+                f"stay within {self._o.width} x {self._o.height}",
             )
         if new.pixel_format.bayer and (x % 2 or y % 2):
-            raise self._refuse("configure", f"roi {new.roi}", "a mosaic begins at even x and y")
+            raise OutOfRange(
+                self.name, "configure", f"roi {new.roi}", "a mosaic begins at even x and y"
+            )
         self._set = new
         return self.settings()
 

@@ -53,7 +53,12 @@ class VirtualDevice(Device):
         """Every call starts here. Raises what the fault schedule has for it."""
         self._halted.clear()
         if not self._connected:
-            raise DeviceLost(self.name, act, "not connected", "connect it first")
+            raise DeviceLost(
+                self.name,
+                act,
+                "not connected",
+                "check its power and cable, and wait until it is connected again",
+            )
         try:
             return self.faults.strike(act, self._halted, timeout_s)
         except DeviceLost:

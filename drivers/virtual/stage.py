@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from drivers.base.device import Context, Identity, Options
-from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceRefused, DeviceTimeout, OutOfRange
 from drivers.base.stage import Stage, StageInfo, StageState, StageStatus
 from drivers.clock import NS
 from drivers.virtual.device import VirtualDevice, VirtualOptions
@@ -207,7 +207,7 @@ class VirtualStage(VirtualDevice, Stage):
         self._begin("circle")
         turns = min(turns, ENDLESS_TURNS)
         if not (radius_mm > 0 and turns > 0):
-            raise DeviceRefused(
+            raise OutOfRange(
                 self.name, "circle", f"radius {radius_mm:g}, {turns:g} turns", "both are above 0"
             )
         x, y = centre_mm
@@ -261,14 +261,14 @@ class VirtualStage(VirtualDevice, Stage):
             ("y", y, o.travel_y_mm),
         ):
             if not (least <= low and high <= most):
-                raise DeviceRefused(
+                raise OutOfRange(
                     self.name,
                     phase,
                     f"{axis} from {low:g} to {high:g} mm is past the soft limit",
                     f"stay within {least:g} to {most:g} mm",
                 )
         if not 0 < feed_mm_s <= o.max_feed_mm_s:
-            raise DeviceRefused(
+            raise OutOfRange(
                 self.name,
                 phase,
                 f"a feed of {feed_mm_s:g} mm/s",

@@ -12,7 +12,7 @@ class Exit(enum.IntEnum):
 
     OK = 0
     FAILED = 1  # the run or a device failed, or something unforeseen
-    USAGE = 2  # a bad option, bad input, or a scan that this rig cannot do
+    USAGE = 2  # a bad option, bad input, or a scan or a number that this rig cannot do
     UNREACHABLE = 3  # no daemon there, or one of another version
     REFUSED = 4  # the daemon said no: wrong state, busy, locked, unknown run, forbidden
     ABORTED = 5  # the run was aborted

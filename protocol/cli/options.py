@@ -91,7 +91,8 @@ class Option:
         if self.default not in (None, "", False):
             facts.append(f"default {self.default}")
         text = "; ".join(facts)
-        return text[:1].upper() + text[1:]
+        symbol = text[1:2] == ","  # n, β: as the paper writes them
+        return text if symbol else text[:1].upper() + text[1:]
 
     def _struct_of(self, text: str) -> dict[str, Any]:
         """[NAME=]VALUE,VALUE,... as a struct's fields. Raises UmbraError(bad_request)."""

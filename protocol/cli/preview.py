@@ -325,7 +325,7 @@ def told_of(facts: dict[str, Any]) -> str:
     if "mean" in facts and "full_scale" in facts:
         told.append(f"mean {facts['mean']:.0f} of {facts['full_scale']:.0f}")
     if "saturated" in facts:
-        told.append(f"{100 * facts['saturated']:.2f} % saturated")
+        told.append(f"{100 * facts['saturated']:.2f}% saturated")
     if facts.get("age_s", 0.0) >= OLD_S:
         told.append(f"taken {facts['age_s']:.0f} s ago")
     return " · ".join(told)

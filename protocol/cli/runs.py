@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from protocol.cli.delivery import Delivery
+from protocol.cli.exits import Exit
 from protocol.cli.link import Json, Keys, Rig, RunId, connect
 from protocol.cli.output import print_facts, print_json, print_table, say, size, when
+from protocol.cli.watch import conclude
 from protocol.cli.words import HEADINGS, Fetched, ending, frames, method, rows, settings
 from protocol.errors import Code, UmbraError
 from protocol.messages.replies import Run, Runs
@@ -149,7 +151,7 @@ _SOON = {"pause": "pauses after this step", "abort": "is being aborted", "resume
 _QUEUED = "is queued, ahead of the others, to go on where it stopped"
 
 
-def _steer(verb: str, run: str, rig: str | None, keys: str | None, as_json: bool) -> None:
+def _steer(verb: str, run: str, rig: str | None, keys: str | None, as_json: bool) -> RunInfo:
     with connect(rig, keys) as client:
         which = run or client.run_info().id
         getattr(client, verb)(which)
@@ -160,6 +162,7 @@ def _steer(verb: str, run: str, rig: str | None, keys: str | None, as_json: bool
         under_way = not info.state.ended and info.state is not RunState.PAUSED
         soon = _QUEUED if verb == "resume" and info.state is RunState.QUEUED else _SOON[verb]
         print(f"run {info.id}: {soon if under_way else info.state.value}")
+    return info
 
 
 def pause(run: RunId = "", rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
@@ -170,12 +173,13 @@ def pause(run: RunId = "", rig: Rig = None, keys: Keys = None, as_json: Json = F
     _steer("pause", run, rig, keys, as_json)
 
 
-def resume(run: RunId = "", rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:
+def resume(run: RunId = "", rig: Rig = None, keys: Keys = None, as_json: Json = False) -> int:
     """Go on with a paused run, or queue an interrupted one again where it stopped.
 
-    --json: a Run.
+    --json: a Run. Exits with 1 if it has failed again already; of later `umbra watch` tells.
     """
-    _steer("resume", run, rig, keys, as_json)
+    info = _steer("resume", run, rig, keys, as_json)
+    return conclude(info) if info.state is RunState.FAILED else Exit.OK
 
 
 def abort(run: RunId = "", rig: Rig = None, keys: Keys = None, as_json: Json = False) -> None:

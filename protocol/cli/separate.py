@@ -184,7 +184,7 @@ def usable(client: Client) -> None:
     """Raise UmbraError(bad_input) with the camera's own words if it cannot read its recording."""
     for device in client.devices():
         if device.health is not Health.READY:
-            said = device.message.removeprefix("camera: connect: ")
+            said = device.message.removeprefix("connect: ")
             raise UmbraError(Code.BAD_INPUT, as_typed(said))
 
 

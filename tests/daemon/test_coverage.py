@@ -269,3 +269,26 @@ def test_most_lit_pixels_lost_is_said() -> None:
     assert len(lines) == 1
     whole = separate(sweep(WHOLE))
     assert not [line for line in whole.facts["advice"] if "cannot be separated" in line]
+
+
+@pytest.mark.parametrize("stride", [0.5, 4.0])  # a pixel is in the umbra in 16 frames, or in 2
+def test_what_noise_leaves_in_the_components_is_stated(stride: float) -> None:
+    def swept(seed: int) -> Components:
+        rng = np.random.default_rng(seed)
+        light = sweep(np.arange(-8, WIDTH + 8, stride), noise=0.0)
+        estimator = Occluder(Response(full_scale=65535), lit_fraction=1.0)
+        for frame in light:
+            noisy = np.clip(frame + rng.normal(0, 150.0, frame.shape), 0, 65535)
+            estimator.update(np.rint(noisy).astype(np.uint16), Observation())
+        return estimator.result()
+
+    scans = [swept(seed) for seed in range(3)]
+    good = np.all([scan.quality == 0 for scan in scans], axis=0)
+    assert good.mean() > 0.5
+    direct, _ = scene()
+    for name, plane in (("direct", "direct_std"), ("global_", "global_std")):
+        real = np.std([getattr(scan, name) for scan in scans], axis=0, ddof=1)[good]
+        stated = np.mean([scan.planes[plane] for scan in scans], axis=0)[good]
+        assert 0.8 < np.median(stated) / (np.median(real) / 0.833) < 1.25
+    off = np.mean([scan.direct for scan in scans], axis=0)[good] - direct[good]
+    assert abs(np.median(off)) < 60.0  # less than half of a sample's deviation

@@ -55,6 +55,13 @@ def test_read_and_shot_noise_are_told_whatever_the_blur(
         assert float(noise.deviation(np.array([level]))[0]) == pytest.approx(true, rel=0.08)
 
 
+def test_a_frame_in_another_s_place_is_no_noise() -> None:
+    followed, taken = frames(Checkerboard(), Scene(sigma=0.004))
+    for index, frame in enumerate(taken):
+        followed.add(taken[11] if index == 12 else frame, index)
+    assert followed.noise(followed.light(), average=1) is None
+
+
 def test_a_row_of_shifts_that_lacks_one_is_left_out() -> None:
     followed, taken = frames(Checkerboard(), Scene(sigma=0.01))
     for index, frame in enumerate(taken):

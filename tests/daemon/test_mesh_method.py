@@ -158,7 +158,7 @@ def test_the_camera_as_it_is_set_bounds_the_feed() -> None:
         (Mesh(hole_mm=5.0), RIG, "go together"),
         (Mesh(hole_mm=12.0, pitch_mm=10.0), RIG, "run into each other"),
         (Mesh(hole_fraction=0.3, radius_mm=40.0), RIG, "leaves the stage's travel"),
-        (Mesh(hole_mm=6.25, pitch_mm=10.0, scene_mm=900.0), RIG, "too wide"),
+        (Mesh(hole_mm=6.25, pitch_mm=10.0, scene_mm=900.0), RIG, r"too wide.*--source-deg"),
         (Mesh(hole_mm=6.25, pitch_mm=10.0, lights=("sun",)), RIG, "no light 'sun', but lamp"),
         (
             Mesh(hole_mm=6.25, pitch_mm=10.0, references=(Reference.OPEN,)),

@@ -135,6 +135,55 @@ def test_a_tripod_that_twists_is_turned_back() -> None:
             np.testing.assert_allclose(whole @ corner, corner, atol=0.25)
 
 
+def part(shots: Sequence[NDArray[Any]], height: int, width: int) -> list[NDArray[Any]]:
+    """The middle of pictures, as a camera with a small region of interest gives it."""
+    top, left = (HEIGHT - height) // 2, (WIDTH - width) // 2
+    return [np.ascontiguousarray(x[top : top + height, left : left + width]) for x in shots]
+
+
+def test_a_tripod_that_twists_from_the_beginning_before_a_small_picture() -> None:
+    height, width = 96, 128
+    rng = np.random.default_rng(9)
+    there = shaken(REFERENCE + 8, 1.0)
+    turns = rng.normal(0.0, 0.3, len(there))
+    middle = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+    shots = [
+        cv2.warpAffine(
+            frame,
+            cv2.getRotationMatrix2D(middle, degrees, 1.0),
+            (WIDTH, HEIGHT),
+            flags=cv2.INTER_LANCZOS4,
+        )
+        for frame, degrees in zip(frames(there), turns, strict=True)
+    ]
+    shots = part(shots, height, width)
+    camera = Registration(DEEP, mesh=True)
+    assert camera.suits(shots[0].shape)
+    for frame in shots[:REFERENCE]:
+        camera.learn(frame)
+    assert camera.tells
+    places = [camera.of(frame) for frame in shots[REFERENCE:]]
+    assert all(place.found for place in places)
+    apart = np.array([-math.degrees(p.turn) for p in places]) - turns[REFERENCE:]
+    assert np.abs(apart - np.median(apart)).max() < 0.12
+    shifts = np.array([(p.x, p.y) for p in places])
+    for k in range(len(places)):  # the shift came first, and was turned with the picture
+        angle = math.radians(-turns[REFERENCE + k])
+        turned = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        shifts[k] -= turned @ there[REFERENCE + k]
+    assert np.abs(shifts - np.median(shifts, axis=0)).max() < 0.15
+
+
+def test_a_frame_that_is_not_the_scenes_is_not_placed() -> None:
+    shots = part(frames(STILL), 96, 128)
+    camera = Registration(DEEP, mesh=True)
+    for frame in shots:
+        camera.learn(frame)
+    assert camera.tells
+    blurred = cv2.blur(np.roll(shots[0], 3, axis=1), (15, 1))  # drawn along by a blow
+    assert not camera.of(blurred).found
+
+
 def test_a_recording_is_aligned_from_its_first_frame() -> None:
     there = np.array(shaken(REFERENCE, 2.0))
     shots = frames([(float(x), float(y)) for x, y in there])
@@ -210,23 +259,27 @@ def test_a_gust_is_aligned_and_a_fall_is_left_out() -> None:
     assert apart(mended) < 0.4 * apart(broken)
 
 
-def test_an_interrupted_scan_goes_on_with_the_same_decisions() -> None:
-    shifts = [*shaken(REFERENCE, 2.0), *shaken(12, 4.0, seed=9)]
-    shots = frames(shifts)
-    _, decided = separated(shifts, align=True)
-    assert decided[REFERENCE - 1].fresh  # it shook before
+def test_a_scan_interrupted_while_the_place_is_learned_goes_on_with_the_same_decisions() -> None:
+    cut = REFERENCE // 2
+    shots = part(frames([*shaken(REFERENCE, 2.0), *shaken(12, 4.0, seed=9)]), 96, 128)
     bench = Bench(
-        CameraInfo(WIDTH, HEIGHT, PixelFormat.MONO16), stage=StageInfo(((0, 500), (0, 300)), 100.0)
+        CameraInfo(128, 96, PixelFormat.MONO12), stage=StageInfo(((0, 500), (0, 300)), 100.0)
     )
-    method = method_for(Mesh(hole_mm=HOLES.hole_mm, pitch_mm=HOLES.pitch_mm), bench)
+    spec = Mesh(hole_mm=HOLES.hole_mm, pitch_mm=HOLES.pitch_mm)
+    whole, method = method_for(spec, bench), method_for(spec, bench)
     step = method.step(0, {})
     assert step is not None
-    cut = REFERENCE + 4
-    for frame, observation in zip(shots[:cut], decided[:cut], strict=True):
-        method.recall(frame, observation)
-    for k in range(cut, len(shots)):
-        taken = Taken(0, k, incomplete=False, pixels=shots[k])
-        assert method.observe(step, taken) == decided[k]
+    decided = []
+    for k, frame in enumerate(shots):
+        taken = Taken(0, k, incomplete=False, pixels=frame)
+        observation = whole.observe(step, taken)
+        if k < cut:
+            method.recall(frame, observation)
+        else:
+            assert method.observe(step, taken) == observation
+        decided.append(observation)
+    assert decided[REFERENCE - 1].fresh  # it shook before
+    assert sum(o.warp is not None for o in decided[REFERENCE:]) > 8
 
 
 def test_still_frames_are_used_as_they_are() -> None:

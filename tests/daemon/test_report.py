@@ -127,19 +127,30 @@ def test_figures_and_advice_of_a_troubled_run() -> None:
     )
     text = Page(report.render(troubled)).text
     assert "2 · 1" in text
-    assert "96.7 %" in text
+    assert "96.7%" in text
     assert "Missing: the trigger was lost 2 frames 7–8" in text
     assert "Not used: packets were lost 1 frame 9" in text
     assert "never lit" in text.partition("On no pixel:")[2]
     lines = report.advice(troubled)
     assert lines[0].startswith("2 frames missing")
-    assert any("3.12 % of the pixels" in line and "Expose more briefly" in line for line in lines)
-    assert not any("single" in line for line in lines), "too few to be worth a line"
+    assert lines[-1] == "Flags of the pixels, explained under Quality: saturated 3.12%."
+    assert "Expose more briefly" in text.partition("saturated 3.12% A sample")[2]
+
+
+def test_advice_is_said_once() -> None:
+    line = "in 30.9% of the pixels patterns disagree"
+    text = report.render(subject(facts=bits(disagree=0.309, single=2e-5) | {"advice": [line]}))
+    assert "<em>&lt; 0.01%</em>" in text
+    words = Page(text).text
+    assert words.count("patterns disagree") == 1
+    assert f"I{line[1:]}." in words
+    assert words.count("Patterns give different components here") == 1, "under Quality only"
+    assert " %" not in words
 
 
 def test_advice_for_a_dark_scene_and_for_a_good_one() -> None:
     (line,) = report.advice(subject(white=25.5))
-    assert "10 % of the camera's scale" in line
+    assert "10% of the camera's scale" in line
     assert "8 times as long" in line
     (line,) = report.advice(subject())
     assert line.startswith("Nothing to mend")
@@ -189,7 +200,7 @@ def test_global_with_ambient_light_is_called_so() -> None:
 def test_truth_is_a_headline() -> None:
     truth = {"rmse_direct": 0.00992, "rmse_global": None}
     text = Page(report.render(subject(facts=bits() | {"truth": truth}))).text
-    assert "0.992 % of full scale: RMS error of direct" in text
+    assert "0.992% of full scale: RMS error of direct" in text
     assert "unknown of full scale: RMS error of global" in text
 
 
@@ -205,6 +216,29 @@ def test_pace_is_measured_from_the_exposures() -> None:
     text = Page(report.render(subject(records=[record(i) for i in range(1000)]))).text
     assert "median 40.0 ms" in text
     assert "Pace" not in Page(report.render(subject(records=[record(0)]))).text
+
+
+def test_photographs_have_no_times_nor_settings_of_a_camera() -> None:
+    counts = {"software": 25}
+    read = subject(
+        file={"sequencing": {"mode": "recorded", "why": "a recording", "counts": counts}},
+        records=[record(i) for i in range(25)],
+        timings={"waited_s": 0.001, "rate_hz": 16.6, "separate_s": 2.5},
+    )
+    text = Page(report.render(read)).text
+    assert "frames/s" in Page(report.render(subject(timings={"rate_hz": 16.6}))).text
+    for word in (
+        "frames/s",
+        "from one frame",
+        "waited",
+        "a second",
+        "software",
+        " mode ",
+        " gain ",
+        "auto exp",
+    ):
+        assert word not in text, word
+    assert "separate 2.500 s" in text
 
 
 @pytest.mark.parametrize(

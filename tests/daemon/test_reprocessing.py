@@ -98,6 +98,8 @@ def parent_of(
     run = store.create(
         spec, {"settings": {}}, bench=bench.recorded(), calibration=CALIBRATION, planned=None
     )
+    frames = list(frames)
+    method.foresee(picture for picture in frames if picture is not None)
     kept = FrameStore.create(run.path, camera.shape, camera.pixel_format.dtype, pixels=pixels)
     for index, (picture, (number, sub, step)) in enumerate(
         zip(frames, steps_of(method), strict=False)
@@ -330,6 +332,24 @@ def test_a_stick_by_hand_is_the_same_again(store: Store, film: list[NDArray[Any]
     by_hand = Bench(OUTDOORS.camera)
     parent = parent_of(store, Stick(frames=30), film[:30], bench=by_hand)
     assert same(parent, reprocessed(store, parent))
+
+
+def test_a_recording_that_shakes_from_the_beginning_is_the_same_again(
+    store: Store, film: list[NDArray[Any]]
+) -> None:
+    rng = np.random.default_rng(6)
+    shots = [
+        np.ascontiguousarray(np.roll(shot, rng.integers(-2, 3, 2), (0, 1))[36:132, 48:176])
+        for shot in film[:50]
+    ]
+    camera = CameraInfo(
+        128, 96, PixelFormat.MONO12, black_level=63.0, recorded=True, frame_count=len(shots)
+    )
+    parent = parent_of(store, Mesh(hole_mm=12.5, pitch_mm=20.0), shots, bench=Bench(camera))
+    assert sum(o.warp is not None for o in decisions(parent)) > 30
+    again = reprocessed(store, parent)
+    assert decisions(again) == decisions(parent)
+    assert same(parent, again)
 
 
 # ---------------------------------------------------------------- what goes wrong

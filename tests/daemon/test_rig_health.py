@@ -23,7 +23,8 @@ def test_a_check_that_is_older_than_the_loss_says_nothing() -> None:
         member.pending.result(60)  # and has it, but has not looked at it
         rig.failed(DeviceLost("camera", "grab", "gone"))
         rig.tend()
-        assert [d.health for d in rig.devices() if d.name == "camera"] == [Health.LOST]
+        [lost] = [d for d in rig.devices() if d.name == "camera"]
+        assert (lost.health, lost.message) == (Health.LOST, "grab: gone"), "its name is beside it"
         rig.tend()  # connects again
         assert member.pending is not None
         member.pending.result(60)

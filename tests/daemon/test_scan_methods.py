@@ -9,7 +9,7 @@ import pytest
 
 from daemon.scans import catalog
 from daemon.scans.method import Bench, Expose, Method, Taken, Unsuitable, Watch
-from daemon.separation.estimator import Components, Lighting
+from daemon.separation.estimator import Components, Lighting, Quality
 from drivers.base.camera import CameraInfo
 from drivers.base.pixelformat import PixelFormat
 from drivers.base.projector import ProjectorInfo
@@ -174,6 +174,20 @@ def test_a_stick_thinner_than_the_penumbra_is_told(
 def test_a_stick_that_cannot_be(spec: Stick, bench: Bench, said: str) -> None:
     with pytest.raises(Unsuitable, match=said):
         catalog.method_for(spec, bench)
+
+
+@pytest.mark.parametrize(
+    ("spec", "frames", "told"),
+    [(TwoImage(), 2, True), (TwoImage(bracket=(1.0, 4.0)), 4, False), (Stick(), 9, False)],
+)
+def test_a_bracket_is_advised_where_there_can_be_one(
+    spec: AnyScan, frames: int, told: bool
+) -> None:
+    plane = np.zeros((2, 2), np.float32)
+    clipped = np.full((2, 2), np.uint16(Quality.SATURATED))
+    method = catalog.method_for(spec, recorded(frames))
+    found = method.conclude(Components(plane, plane, clipped, {}, {})).facts
+    assert any("--bracket" in line for line in found.get("advice", ())) == told
 
 
 def test_names() -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from daemon.separation.envelope import block_mean
 from daemon.separation.estimator import Components, Lighting, Observation
 from daemon.separation.radiometry import Response
 from daemon.separation.single import PeaksAndValleys
+from protocol.scans.projected import SingleImage
+from tests.daemon.scene import Scene
 
 SHAPE = (96, 160)
 LEAK = 0.05
@@ -61,3 +64,23 @@ def test_stripes_that_the_camera_does_not_resolve_are_told() -> None:
     assert any("camera pixels wide" in line for line in fine.facts["advice"])
     coarse, _ = _separated(3, references=True)
     assert not any("camera pixels wide" in line for line in coarse.facts["advice"])
+
+
+@pytest.mark.parametrize("sigma", [0.003, 0.02])
+def test_what_noise_lifts_peaks_by_is_in_the_deviation(sigma: float) -> None:
+    """Stripes that blur leaves whole: the rest of the error is noise's."""
+    scene = Scene(width=192, height=128, sigma=sigma, blur=0.4, ambient=0.03)
+    found = scene.scan(SingleImage(stripe=8, window=17))
+    inside = np.s_[3:-3, 3:-3]
+    error = (found.direct - block_mean(scene.direct.astype(np.float32), 4))[inside]
+    noise, stated = (found.planes[name][inside] for name in ("direct_noise", "direct_std"))
+    assert np.mean(error) > 2.0 * np.median(noise)
+    assert 0.75 < np.sqrt(np.mean(error**2) / np.mean(stated**2)) < 1.35
+
+
+def test_blur_that_nothing_tells_is_in_the_deviation_of_fine_stripes() -> None:
+    scene = Scene(width=192, height=128, sigma=0.003, blur=0.8)
+    for stripe, least, most in ((4, 0.04, 0.06), (8, 0.0, 0.03)):
+        found = scene.scan(SingleImage(stripe=stripe, window=17))
+        off = found.planes["direct_std"] / found.direct
+        assert least < np.median(off) < most

@@ -265,6 +265,8 @@ def test_settings_are_history(tmp_path: Path) -> None:
     write(tmp_path / "a.png", picture(0))
     cam = connected(tmp_path, exposure_us=5000.0)
     assert cam.configure(CameraSettings(exposure_us=5000.0)).roi == (0, 0, 16, 12)
+    assert cam.settings().frame_rate_hz is None
+    assert connected(tmp_path, rate_hz=12.0).settings().frame_rate_hz == 12.0
     with pytest.raises(DeviceRefused, match=r"exposure_us is 5000.0 and recorded, not 1.0"):
         cam.configure(CameraSettings(exposure_us=1.0))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drivers.base.camera import Acquisition, CameraSettings, Frame
 from drivers.base.device import Context
-from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceGarbled, DeviceLost, DeviceRefused, DeviceTimeout, OutOfRange
 from drivers.base.pixelformat import PixelFormat
 from drivers.clock import NS, ScaledClock
 from drivers.registry import build
@@ -246,7 +246,7 @@ def test_a_region_of_interest_is_a_part_of_the_picture() -> None:
 def test_settings_out_of_range_are_refused(wanted: CameraSettings, says: str) -> None:
     _, camera = rig()
     before = camera.settings()
-    with pytest.raises(DeviceRefused, match=says):
+    with pytest.raises(OutOfRange, match=says):
         camera.configure(wanted)
     assert camera.settings() == before
     camera.start(Acquisition.SOFTWARE)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drivers.base.camera import Acquisition
 from drivers.base.device import Context
-from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceRefused, DeviceTimeout, OutOfRange
 from drivers.base.stage import StageState
 from drivers.clock import NS, ScaledClock
 from drivers.registry import build
@@ -175,7 +175,7 @@ def test_halt_stops_and_forgets_the_rest() -> None:
 )
 def test_limits_are_checked_before_anything_moves(call: Any, says: str) -> None:
     stage = homed(context())
-    with pytest.raises(DeviceRefused, match=says):
+    with pytest.raises(OutOfRange, match=says):
         call(stage)
     assert stage.status().position_mm == (0, 0)
 

@@ -404,6 +404,14 @@ def test_steering_without_a_run_names_the_one_it_means(rig: Rig) -> None:
     assert asked(rig, commands.Abort).run == "run-1"
 
 
+def test_a_run_that_fails_again_at_once_is_no_success(rig: Rig, capsys: Captured) -> None:
+    rig.make("direct")
+    end = End(state=RunState.FAILED, reason="the disk is too small", code=Code.STORAGE_FULL)
+    rig.change("run-1", state=RunState.FAILED, end=end, tell=False)
+    assert run(["resume"]) == Exit.FAILED
+    assert "run run-1 failed: the disk is too small" in capsys.readouterr().err
+
+
 # ---------------------------------------------------------------- products
 
 

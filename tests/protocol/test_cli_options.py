@@ -61,6 +61,17 @@ def test_fields_become_options() -> None:
     assert options["steps"].described() == "Default 1,2"
 
 
+def test_symbols_keep_their_case() -> None:
+    class Symbols(msgspec.Struct):
+        beta: Annotated[float, Meta(description="β, the part that is hole")] = 0.5
+        window: Annotated[int, Meta(description="n, camera px")] = 11
+        plain: Annotated[int, Meta(description="a number")] = 1
+
+    said = [option.described() for option in options_of(Symbols)]
+    assert said == ["β, the part that is hole; default 0.5", "n, camera px; default 11",
+                    "A number; default 1"]  # fmt: skip
+
+
 def test_what_is_given_becomes_the_struct() -> None:
     given = {"cycles": 4, "mode": "fast", "steps": "3, 5", "names": "slow", "level": 0.25}
     assert build(New, {**given, "loud": True, "note": None}) == New(

@@ -31,7 +31,7 @@ homing_feed_mm_s = 200
 name = "left"
 driver = "virtual"
 """
-CAMERA = 'pixel_format = "Mono12"\nframe_rate_hz = 25\nbuffers = 64\n'
+CAMERA = 'pixel_format = "Mono12"\nframe_rate_hz = 12\n'
 MESH = umbra.Mesh(hole_mm=12.5, pitch_mm=20.0, source_deg=0.1, scene_mm=150.0, coverage=0.97)
 ENDLESS = umbra.Mesh(hole_mm=12.5, pitch_mm=20.0, coverage=1.0, time_limit_s=600.0)
 

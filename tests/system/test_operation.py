@@ -98,7 +98,7 @@ def test_work_by_hand(daemon: Daemon) -> None:
         assert halved.exposure_us == pytest.approx(before.exposure_us / 2)
         with pytest.raises(UmbraError) as caught:
             rig.camera(exposure_us=1e12)
-        assert caught.value.code is Code.DEVICE_REFUSED
+        assert caught.value.code is Code.UNSUITABLE
         rig.dark()
         assert rig.status().state is RigState.IDLE
         run = rig.scan(umbra.TwoImage())  # a scan follows work by hand

@@ -195,6 +195,6 @@ def test_the_command_line(staged: Daemon) -> None:
         done = umbra_stage("move", "12.5", "40", "--wait", "--json")
         assert json.loads(done.stdout)["position_mm"] == pytest.approx([12.5, 40])
         beyond = umbra_stage("move", "1000", "0")
-        assert beyond.returncode == 1
+        assert beyond.returncode == 2
         assert "past the soft limit" in beyond.stderr
         assert "position  12.500, 40.000 mm" in umbra_stage("status").stdout

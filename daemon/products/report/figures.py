@@ -62,5 +62,5 @@ def pace(records: Sequence[FrameRecord]) -> str:
         '<svg viewBox="0 0 640 62" role="img" aria-label="Time between frames">'
         f'<g class="bars">{bars}</g></svg>'
         f'<p class="quiet">Time from one frame to the next, in order: median {middle:.1f} ms, '
-        f"95 % within {late:.1f} ms, longest {top:.1f} ms.</p>"
+        f"95% within {late:.1f} ms, longest {top:.1f} ms.</p>"
     )

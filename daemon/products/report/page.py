@@ -88,9 +88,18 @@ def files(products: Sequence[Product]) -> str:
     )
 
 
+def of_recording(file: RunFile) -> bool:
+    """Whether the frames are photographs or a video: when and with what they were taken is not
+    known, and what the run has instead is how fast they were read."""
+    return (file.sequencing or {}).get("mode") == "recorded"
+
+
 def timed(file: RunFile, timings: Mapping[str, float]) -> Iterable[tuple[str, str]]:
     """Timings in words."""
+    of_a_rig = {"waited_s", "rate_hz"} if of_recording(file) else set()
     for name, value in {**file.timings, **timings}.items():
+        if name in of_a_rig:
+            continue
         if name.endswith("_s"):
             yield name[:-2], f"{value:.3f} s" if value >= 1 else f"{value * 1e3:.1f} ms"
         elif name.endswith("_hz"):
@@ -108,7 +117,7 @@ def asked(file: RunFile) -> Iterable[tuple[str, Any]]:
 
 def in_step(file: RunFile) -> Iterable[tuple[str, Any]]:
     """How exposures were kept in step with patterns."""
-    if file.sequencing is not None:
+    if file.sequencing is not None and not of_recording(file):
         yield "mode", f"{file.sequencing['mode']}: {file.sequencing['why']}"
         for name, count in file.sequencing["counts"].items():
             yield f"exposures {name}", count
@@ -122,7 +131,7 @@ def told(spec: AnyScan) -> Iterable[tuple[str, Any]]:
             yield from (
                 (f"{key}: {name}", part) for name, part in value.items() if part != unchanged[name]
             )
-        elif value is not None:
+        elif value not in (None, (), []):
             yield key, value
 
 

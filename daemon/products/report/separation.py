@@ -22,23 +22,25 @@ from daemon.products.report.page import (
     flat,
     in_step,
     missing,
+    of_recording,
     page,
     table,
     template,
     timed,
     told,
 )
-from daemon.products.report.words import frames, lower, percent
-from daemon.separation.finish import ADVICE
+from daemon.products.report.words import frames, percent
 from daemon.storage.frames import FrameRecord
 from daemon.storage.runfolder import RunFile
 from protocol.messages.runs import Product
 from protocol.scans.occluded import OccluderScan
 from protocol.scans.projected import PatternScan
 
-_ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a line of advice
+_ADVISED_FROM = 0.005  # of the pixels: a bit on fewer is not worth a word of advice
 _DIM_BELOW = 0.25  # of full scale: a scene that uses less than this is under-exposed
 _MANY_LOST = 0.1  # of a video's frames
+_OF_A_RIG = {"auto_exposure", "coverage", "frame_rate_hz", "sweeps", "time_limit_s"}
+"""Of a scan: how photographs were taken does not follow from it."""
 _FOOTER = (
     "Pictures are for eyes: sRGB, all at one scale, clipped. The measurements are in the TIFF "
     "files: linear, float32, NaN where nothing was measured."
@@ -77,7 +79,7 @@ def render(subject: Subject) -> str:
         legend=_legend(subject.facts),
         histogram=histogram(subject.facts.get("exposure_histogram")),
         exposure=escape(_exposure(subject)),
-        pace=pace(subject.records),
+        pace="" if of_recording(file) else pace(subject.records),
         settings=table(_settings(subject)),
         calibration=calibration(file),
         timings=table(timed(file, subject.timings)),
@@ -110,12 +112,11 @@ def advice(subject: Subject) -> list[str]:
         )
     if file.rejected:
         lines.append(f"{frames(file.rejected)} recorded but not used: see below why.")
-    lines += facts.get("advice", [])  # the estimator's own
-    for bit in _seen(facts):
-        share = _share(facts, bit.name)
-        said = ADVICE[bit.flag][1] if bit.flag in ADVICE else None
-        if share >= _ADVISED_FROM and not (said and any(said in line for line in lines)):
-            lines.append(f"{percent(share)} of the pixels: {lower(bit.meaning)} {bit.remedy}")
+    lines += map(_sentence, facts.get("advice", ()))  # the estimator's own
+    flagged = [bit for bit in _seen(facts) if _share(facts, bit.name) >= _ADVISED_FROM]
+    if flagged:
+        named = ", ".join(f"{_name(bit)} {percent(_share(facts, bit.name))}" for bit in flagged)
+        lines.append(f"Flags of the pixels, explained under Quality: {named}.")
     top = subject.white / subject.full_scale
     bracketed = isinstance(file.spec, PatternScan) and file.spec.bracket is not None
     if top < _DIM_BELOW and not bracketed and _share(facts, "saturated") < _ADVISED_FROM:
@@ -128,6 +129,11 @@ def advice(subject: Subject) -> list[str]:
     return lines or ["Nothing to mend: well exposed, all frames taken, few pixels flagged."]
 
 
+def _sentence(line: str) -> str:
+    """A line that the command says after a colon."""
+    return f"{line[0].upper()}{line[1:].removesuffix('.')}."
+
+
 def _figures(subject: Subject) -> str:
     file, facts = subject.file, subject.facts
     planned = f" of {file.planned}" if file.planned else ""
@@ -136,7 +142,7 @@ def _figures(subject: Subject) -> str:
         found.append(("missing · rejected", f"{file.missing} · {file.rejected}", "warn"))
     found.append(("pixels without a flag", percent(facts.get("good", {}).get("fraction")), ""))
     rate = subject.timings.get("rate_hz")
-    if rate:
+    if rate and not of_recording(file):
         found.append(("pace", f"{rate:.3g} frames/s", ""))
     truth = facts.get("truth")
     if truth:
@@ -184,7 +190,7 @@ def _legend(facts: Mapping[str, Any]) -> str:
     seen = _seen(facts)
     rows = "".join(
         f'<li><i style="background:{bit.colour}"></i><div><b>{_name(bit)}</b>'
-        f"<em>{percent(_share(facts, bit.name))}</em><p>{escape(bit.meaning)}</p>"
+        f"<em>{escape(percent(_share(facts, bit.name)))}</em><p>{escape(bit.meaning)}</p>"
         f'<p class="do">{escape(bit.remedy)}</p></div></li>'
         for bit in seen
     )
@@ -203,24 +209,26 @@ def _exposure(subject: Subject) -> str:
 
 
 def _settings(subject: Subject) -> Iterable[tuple[str, Any]]:
+    photographs = of_recording(subject.file)
     first = next((r for r in subject.records if not r.missing), None)
     if first:
         if first.exposure_us:
             own_us = first.exposure_us / first.observation.exposure
             yield "exposure", f"{own_us / 1e3:.4g} ms"
-        yield "gain", f"{first.gain:g}"
+        if not photographs:
+            yield "gain", f"{first.gain:g}"
     for key in ("estimator", "lit_fraction", "leakage", "black_level", "tone", "full_scale"):
         if key in subject.facts:
             yield key, subject.facts[key]
     yield from in_step(subject.file)
     known = {"method", "note", "exposure_us", "gain", "lit_fraction", "estimator", "radiometry"}
-    known.add("mode")
+    known |= {"mode"} | (_OF_A_RIG if photographs else set())
     yield from ((key, value) for key, value in told(subject.file.spec) if key not in known)
     yield "pictures show as white", f"{subject.white:.4g} counts"
 
 
 def _plain_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
-    shown_elsewhere = {"exposure_histogram", "quality", "units", "good"}
+    shown_elsewhere = {"advice", "exposure_histogram", "quality", "units", "good"}
     return {k: v for k, v in facts.items() if k not in shown_elsewhere}
 
 

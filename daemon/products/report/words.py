@@ -23,8 +23,8 @@ def percent(share: float | None) -> str:
     if share is None or not math.isfinite(share):
         return "unknown"
     if 0 < share < 0.0001:
-        return "< 0.01 %"
-    return f"{100 * share:.3g} %" if share < 0.9995 or share == 1 else "> 99.9 %"
+        return "< 0.01%"
+    return f"{100 * share:.3g}%" if share < 0.9995 or share == 1 else "> 99.9%"
 
 
 def size(count: int) -> str:
@@ -40,11 +40,6 @@ def size(count: int) -> str:
 def frames(number: int) -> str:
     """So many of them."""
     return "1 frame" if number == 1 else f"{number} frames"
-
-
-def lower(sentence: str) -> str:
-    """A sentence that goes on after a colon."""
-    return sentence[0].lower() + sentence[1:]
 
 
 def ranges(numbers: Sequence[int]) -> str:
