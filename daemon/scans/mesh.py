@@ -25,7 +25,8 @@ class MeshMethod(OccluderMethod[Mesh]):
     """Circles until every lit pixel was in full light and in the umbra.
 
     Where the mesh's geometry is known, radius and feed are planned from it, and a request that
-    does worse is done all the same, with `warnings`.
+    does worse is done all the same, with `warnings`; `least` is the part of a turn that the circle
+    has every point, at least, in full light, and in the umbra (None: not known, or none).
     """
 
     name: ClassVar[str] = "mesh"
@@ -41,6 +42,7 @@ class MeshMethod(OccluderMethod[Mesh]):
             "scene (--hole-mm, --pitch-mm, --scene-mm)"
         }
         self._mesh = _mesh_of(spec)
+        self.least: float | None = None
         wanted = spec.references or ()
         live = not bench.camera.recorded
         if live and Reference.OPEN in wanted:
@@ -52,7 +54,12 @@ class MeshMethod(OccluderMethod[Mesh]):
         self.hole_fraction = spec.hole_fraction
         if self.hole_fraction is None and self._mesh is not None:
             self.hole_fraction = self._mesh.hole_fraction
+        if self._mesh is not None and spec.radius_mm is not None:
+            self._serve(geometry.circle(self._mesh, spec.radius_mm, _penumbra(spec)))
         super().__init__(spec, bench, self._circle(spec, bench) if live else None)
+
+    def _serve(self, circle: geometry.Circle) -> None:
+        self.least = min(circle.lit, circle.unlit) or None
 
     def _circle(self, spec: Mesh, bench: Bench) -> Circle:
         """The motion: as asked for, else as planned."""
@@ -94,7 +101,7 @@ class MeshMethod(OccluderMethod[Mesh]):
         Raises Unsuitable where no circle covers every point.
         """
         assert bench.stage is not None
-        penumbra = penumbra_mm(spec.scene_mm or 0.0, source_deg=spec.source_deg)
+        penumbra = _penumbra(spec)
         rate = spec.frame_rate_hz or min(bench.camera.max_rate_hz or _RATE_HZ, _RATE_HZ)
         exposure_us = spec.exposure_us or bench.exposure_us
         exposure = exposure_us * 1e-6 if exposure_us else min(_EXPOSURE_S, 1.0 / rate)
@@ -110,6 +117,7 @@ class MeshMethod(OccluderMethod[Mesh]):
             raise Unsuitable(str(error), "$.pitch_mm") from error
         radius = wanted_mm or best.circle.radius_mm
         asked = geometry.circle(mesh, radius, penumbra)
+        self._serve(asked)
         warnings = []
         for part, what in ((asked.lit, "in full light"), (asked.unlit, "in the umbra")):
             if part == 0.0:
@@ -142,7 +150,18 @@ class MeshMethod(OccluderMethod[Mesh]):
                 self.response,
                 hole_fraction=self.hole_fraction,
                 averaged=self.spec.estimator == "auto",
+                least=self.least,
             ),
+        )
+
+    def uncovered(self) -> str:
+        """See `OccluderMethod`."""
+        if self.least is None:
+            return super().uncovered()
+        return (
+            "by the mesh's geometry this circle lights and shades every point for "
+            f"{self.least:.0%} of a turn at least: what is left changes little by little, as "
+            "mirrors and translucent things do, or the mesh's shadow does not reach it"
         )
 
     def conclude(self, components: Components) -> Components:
@@ -152,6 +171,10 @@ class MeshMethod(OccluderMethod[Mesh]):
         if self.warnings:
             facts["warnings"] = list(self.warnings)
         return replace(components, facts=facts)
+
+
+def _penumbra(spec: Mesh) -> float:
+    return penumbra_mm(spec.scene_mm or 0.0, source_deg=spec.source_deg)
 
 
 def _mesh_of(spec: Mesh) -> geometry.Mesh | None:

@@ -311,9 +311,14 @@ class OccluderMethod(Method[O]):
         if self._in_vain.turns(summary, seconds, self._watch.motion) < VAIN_TURNS:
             return ""
         return f"{reached}: {VAIN_TURNS} turns covered no more" + (
-            self._lost()
-            or "; what is left this circle does not reach, or it lies in shadows or mirrors of the "
-            "scene's own that are narrower than the mesh's pitch"
+            self._lost() or f"; {self.uncovered()}"
+        )
+
+    def uncovered(self) -> str:
+        """Why places may have stayed uncovered, of a scan that lost few frames."""
+        return (
+            "what is left this circle does not reach, or it lies in mirrors of the scene's own "
+            "that are narrower than the mesh's pitch"
         )
 
     def _lost(self) -> str:

@@ -42,13 +42,19 @@ class MeshOccluder:
     `averaged` takes the mean of all samples in full light and in the umbra and states what noise
     leaves in it (`planes` direct_std, global_std); without it the single brightest and darkest (the
     paper's) are taken, whose error is a bias. `planes["coverage"]` (uint16) counts the frames in
-    full light or in the umbra, whichever are fewer; 0: not covered.
+    full light or in the umbra, whichever are fewer; 0: not covered; `least` as in `coverage`.
     """
 
     def __init__(
-        self, response: Response, *, hole_fraction: float | None, averaged: bool = True
+        self,
+        response: Response,
+        *,
+        hole_fraction: float | None,
+        averaged: bool = True,
+        least: float | None = None,
     ) -> None:
         self._response = response
+        self._least = least
         self._beta = hole_fraction
         self._averaged = averaged
         self._references = References(response)
@@ -139,7 +145,7 @@ class MeshOccluder:
         pull = self._pull(noise, levels, split.other) if self._averaged else {}
         pitch = self._pitch(beta)
         of_picture = coverage_of_mosaic if self._response.bayer else coverage
-        covered = of_picture(levels, one, pitch)
+        covered = of_picture(levels, one, pitch, frames, self._least)
         seen = self._lit_of_the_time(levels, covered.frames > 0)
         judged = Judgement.of_extremes(one, frames)
         if self._averaged:
@@ -253,7 +259,7 @@ class MeshOccluder:
             levels = self._levels(noise, part)
             one = self._response.deviation(noise, self._plateaus.high.extreme[part])
             pitch = self._pitch(self._beta or 0.3) / (part[0].step or 1)
-            self._share = coverage(levels, one, max(pitch, 3.0)).share
+            self._share = coverage(levels, one, max(pitch, 3.0), frames, self._least).share
         return {"frames": float(frames), "unused": float(self._unused), "coverage": self._share}
 
 

@@ -117,8 +117,21 @@ def test_lost_frames_are_named_where_coverage_ends() -> None:
     assert method.short()  # most were lost
     assert not lossy(2)[0].short()
     whole, said, _ = lossy(1)
-    assert "does not reach" in said
+    assert "lights and shades every point for 20% of a turn at least: what is left" in said
     assert not whole.short()
+    short_of = lossy(1, replace_spec(KNOWN, radius_mm=4.0))[1]
+    assert "what is left this circle does not reach" in short_of
+
+
+def test_how_long_the_circle_serves_each_point_is_known_of_recordings_too() -> None:
+    told = replace_spec(KNOWN, radius_mm=9.0)
+    for bench in (RIG, replace(RIG, camera=replace(CAMERA, recorded=True, frame_count=72))):
+        method = method_for(told, bench)
+        assert isinstance(method, MeshMethod)
+        assert method.least == pytest.approx(0.2, abs=0.01)
+    unknown = method_for(Mesh(hole_fraction=0.3, radius_mm=9.0), RIG)
+    assert isinstance(unknown, MeshMethod)
+    assert unknown.least is None
 
 
 def test_turns_with_hardly_a_frame_do_not_tell_that_the_circle_reaches_no_more() -> None:

@@ -13,7 +13,7 @@ from daemon.separation.estimator import Quality
 from protocol.scans.occluded import Mesh
 from tests.daemon.outdoor_rig import Outdoors, scan
 
-SPEC = Mesh(hole_mm=25.0, pitch_mm=40.0, scene_mm=150.0, sun=True, time_limit_s=60.0)
+SPEC = Mesh(coverage=1.0, hole_mm=25.0, pitch_mm=40.0, scene_mm=150.0, sun=True, time_limit_s=60.0)
 STAGE = {"hole_mm": 25.0, "pitch_mm": 40.0}
 CAMERA = {"width": 208, "height": 156, "frame_rate_hz": 12.0, "exposure_us": 4000.0}
 SUN = {"strength": 4.0}  # exposed as briefly: the mesh moves less, and is drawn faster
