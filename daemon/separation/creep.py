@@ -67,6 +67,8 @@ class Creep:
         self._frames: dict[int, int] = {}
         self._patterns: dict[int, set[int]] = {}  # the patterns of each group
         self._shape: tuple[int, ...] = ()
+        self._texture: _Texture | None = None  # of white, when patterns have begun
+        self._moved: dict[int, _Motion | None] = {}  # of groups that are whole, against it
 
     def add(self, pixels: NDArray[Any], observation: Observation) -> None:
         """Take in a frame that is used."""
@@ -78,13 +80,29 @@ class Creep:
             return
         self._shape = pixels.shape[:2]
         windows = self._cut(pixels)
+        if group == _WHITE:
+            self._texture = None
+            self._moved.clear()
+        elif group not in self._sums:
+            self._look()
         if group not in self._sums:
             self._sums[group] = np.zeros(windows.shape)
             self._frames[group] = 0
             self._patterns[group] = set()
+        self._moved.pop(group, None)
         self._sums[group] += windows
         self._frames[group] += 1
         self._patterns[group].add(observation.pattern)
+
+    def _look(self) -> None:
+        """What can be told before the last frame is: a result must not wait for it."""
+        if _WHITE not in self._sums:
+            return
+        if self._texture is None:
+            self._texture = _Texture.of(self._mean(_WHITE), self._arms())
+        for group in self._sums.keys() - self._moved.keys() - {_WHITE}:
+            if self._texture is not None and len(self._patterns[group]) >= _FEWEST:
+                self._moved[group] = self._texture.motion_of(self._mean(group))
 
     @property
     def _step(self) -> int:
@@ -118,16 +136,19 @@ class Creep:
         if not groups or not (self._balanced or _WHITE in self._sums):
             return None
         mean = self._mean(*groups)
-        texture = _Texture.of(self._mean(_WHITE) if _WHITE in self._sums else mean, self._arms())
+        texture = self._texture
+        if texture is None:
+            shown = self._mean(_WHITE) if _WHITE in self._sums else mean
+            texture = _Texture.of(shown, self._arms())
         if texture is None:
             return None
         before = self._corner_px(texture.motion_of(mean)) if _WHITE in self._sums else 0.0
-        found = [
-            motion
+        of_groups = (
+            self._moved[group] if group in self._moved else texture.motion_of(self._mean(group))
             for group in groups
             if len(self._patterns[group]) >= _FEWEST
-            and (motion := texture.motion_of(self._mean(group))) is not None
-        ]
+        )
+        found = [motion for motion in of_groups if motion is not None]
         within = [
             self._corner_px(_Motion(one.step - other.step, one.variance + other.variance))
             for n, one in enumerate(found)

@@ -6,6 +6,7 @@ order.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -54,25 +55,30 @@ class Mosaic:
     """
 
     def __init__(self, valid: NDArray[np.bool_], bayer: str) -> None:
-        masks = np.ascontiguousarray(np.moveaxis(colour_masks(_sides(valid), bayer), 0, 2))
+        masks = colour_masks(_sides(valid), bayer)
         self._valid = valid
-        self._missing = None if valid.all() else masks & ~valid[..., None]
-        self._present = (masks & valid[..., None]).astype(np.float32)
+        self._missing = None if valid.all() else ~valid
+        self._masks = masks
+        self._present = (masks & valid).astype(np.float32)
         self._apart = (~masks).astype(np.float32)
         with np.errstate(invalid="ignore", divide="ignore"):
-            self._shares = self._apart / _around(self._present, _NEAR)
+            self._shares = [
+                apart / _around(present, _NEAR)
+                for apart, present in zip(self._apart, self._present, strict=True)
+            ]
 
     def colours(self, plane: Plane) -> Plane:
         """(H, W) -> (H, W, 3) in RGB order: bilinear, normalised by the samples that are there, so
         that borders need no padding."""
-        return self._interpolated(self._there(plane), _NEAR, self._shares)
+        return _merged(self._interpolated(self._there(plane), _NEAR, self._shares))
 
     def noise(self, deviation: Plane) -> Plane:
         """Standard deviations (H, W) of independent samples -> those of `colours`, (H, W, 3): a
         colour that is the mean of n neighbours has less noise than a sample."""
         variance = np.square(self._there(deviation))
-        spread = self._interpolated(variance, np.square(_NEAR), np.square(self._shares))
-        return np.sqrt(spread, out=spread)
+        shares = [np.square(share) for share in self._shares]
+        spread = self._interpolated(variance, np.square(_NEAR), shares)
+        return _merged([np.sqrt(plane, out=plane) for plane in spread])
 
     def error(self, plane: Plane, noise: Plane, colours: Plane) -> Plane:
         """What texture finer than the mosaic may put colours off by, as a deviation (H, W, 3): 0
@@ -96,19 +102,23 @@ class Mosaic:
         texture /= np.square(level)
         part = cv2.blur(texture, (3, 3), borderType=cv2.BORDER_REFLECT)
         part = _MISSED * np.sqrt(np.maximum(part, 0))
-        return np.asarray(np.abs(colours) * self._apart * part[..., None], dtype=np.float32)
+        parts = _merged([part * apart for apart in self._apart])
+        return np.asarray(np.abs(colours) * parts, dtype=np.float32)
 
     def _there(self, plane: Plane) -> Plane:
         return plane if self._missing is None else np.where(self._valid, plane, np.float32(0))
 
-    def _interpolated(self, values: Plane, weights: Plane, shares: Plane) -> Plane:
-        samples = values[..., None] * self._present
-        with np.errstate(invalid="ignore"):  # where there is no neighbour
-            rgb = _around(samples, weights) * shares
-        rgb += samples
-        if self._missing is not None:
-            rgb[self._missing] = np.nan
-        return rgb
+    def _interpolated(self, values: Plane, weights: Plane, shares: Sequence[Plane]) -> list[Plane]:
+        planes = []
+        for mask, present, share in zip(self._masks, self._present, shares, strict=True):
+            samples = values * present
+            with np.errstate(invalid="ignore"):  # where there is no neighbour
+                plane = _around(samples, weights) * share
+            plane += samples
+            if self._missing is not None:
+                plane[mask & self._missing] = np.nan
+            planes.append(plane)
+        return planes
 
 
 def orders_of(pixels: NDArray[np.generic]) -> tuple[str, ...]:
@@ -151,6 +161,10 @@ def _around(plane: Plane, weights: Plane) -> Plane:
     """Sums over a square, weighted along each axis; beyond the border is nothing."""
     summed = cv2.sepFilter2D(plane, -1, weights, weights, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(summed, dtype=np.float32)
+
+
+def _merged(planes: Sequence[Plane]) -> Plane:
+    return np.asarray(cv2.merge(list(planes)), dtype=np.float32)
 
 
 def _sides(plane: NDArray[Any]) -> tuple[int, int]:
