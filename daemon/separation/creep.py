@@ -326,6 +326,8 @@ def _apart(components: Components, px: float) -> Plane:
 
 
 def _smooth(windows: NDArray[Any]) -> Plane:
+    if not windows.size:  # the picture is smaller than one
+        return windows.astype(np.float32)
     stacked = windows.astype(np.float32).reshape(-1, windows.shape[2])  # margins keep them apart
     blurred = cv2.GaussianBlur(stacked, (0, 0), _SMOOTH)
     return np.asarray(blurred, dtype=np.float32).reshape(windows.shape)

@@ -47,9 +47,7 @@ Warp = tuple[float, float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 
 _WORK = 320  # longer side of the pictures that are compared
-_LEAST_SIDE = (
-    120  # small pixels of the longer side: in smaller ones a shift out of reach passed for another
-)
+_LEAST_SIDE = 200  # small pixels of the longer side: in fewer a mesh's shadow passes for motion
 _FLOOR = 0.03  # of the bright places: added to light, so that the dark ones' noise has no say
 _FOLLOWED = 0.25  # of the differences: only a mesh that was taken for the scene explains so much
 _SOFT = 0.5  # px: finer things interpolation moves by another way
