@@ -83,8 +83,6 @@ class Creep:
         if group == _WHITE:
             self._texture = None
             self._moved.clear()
-        elif group not in self._sums:
-            self._look()
         if group not in self._sums:
             self._sums[group] = np.zeros(windows.shape)
             self._frames[group] = 0
@@ -93,16 +91,17 @@ class Creep:
         self._sums[group] += windows
         self._frames[group] += 1
         self._patterns[group].add(observation.pattern)
+        if observation.last and len(self._patterns[group]) == self._each:
+            self._look(group)
 
-    def _look(self) -> None:
-        """What can be told before the last frame is: a result must not wait for it."""
-        if _WHITE not in self._sums:
+    def _look(self, group: int) -> None:
+        """What a whole group tells, before the last frame: a result must not wait for it."""
+        if _WHITE not in self._sums or group == _WHITE:
             return
         if self._texture is None:
             self._texture = _Texture.of(self._mean(_WHITE), self._arms())
-        for group in self._sums.keys() - self._moved.keys() - {_WHITE}:
-            if self._texture is not None and len(self._patterns[group]) >= _FEWEST:
-                self._moved[group] = self._texture.motion_of(self._mean(group))
+        if self._texture is not None:
+            self._moved[group] = self._texture.motion_of(self._mean(group))
 
     @property
     def _step(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -107,13 +108,15 @@ def finish(
         # A colour is interpolated from its neighbours: what is wrong with them is wrong with it.
         quality = spread(quality, Quality.SATURATED)
         direct, indirect = _coloured(direct, indirect, planes, response.bayer)
-        # Where none of them has a colour, the pixel is what they are.
-        missed = ~unknown & np.isnan(direct + indirect).any(axis=2)
-        around = spread(spread(quality, Quality.NEVER_LIT), Quality.NEVER_UNLIT)
-        quality = np.where(missed, around, quality)
-        unknown |= missed
-        direct[unknown] = np.nan
-        indirect[unknown] = np.nan
+        lost = np.isnan(direct + indirect)
+        if lost.any():
+            # Where none of them has a colour, the pixel is what they are.
+            missed = ~unknown & lost.any(axis=2)
+            around = spread(spread(quality, Quality.NEVER_LIT), Quality.NEVER_UNLIT)
+            quality = np.where(missed, around, quality)
+            unknown |= missed
+            direct[unknown] = np.nan
+            indirect[unknown] = np.nan
     counted = count(quality)
     figures = {
         **facts,
@@ -173,13 +176,9 @@ def judge(
 
 def spread(quality: NDArray[np.uint16], flag: Quality) -> NDArray[np.uint16]:
     """The same bits, with `flag` also at the eight neighbours of each pixel that has it."""
-    padded = np.pad((quality & flag) != 0, 1)
-    near = np.zeros(quality.shape, dtype=np.bool_)
-    height, width = quality.shape
-    for y in range(3):
-        for x in range(3):
-            near |= padded[y : y + height, x : x + width]
-    return quality | bits(near, flag)
+    there = (quality & np.uint16(flag)) != 0
+    near = cv2.dilate(there.view(np.uint8), np.ones((3, 3), dtype=np.uint8))
+    return quality | bits(near != 0, flag)
 
 
 def bits(mask: NDArray[np.bool_], flag: Quality) -> NDArray[np.uint16]:
