@@ -30,11 +30,13 @@ _ENOUGH = 400  # neighbours to compare
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """`mirrored` (H, W), figures for quality.json, and lines of advice."""
+    """`mirrored` (H, W), figures for quality.json, and lines of advice; `trusted`: whether the
+    frames are a code's at all."""
 
     mirrored: Mask
     facts: dict[str, Any]
     advice: list[str]
+    trusted: bool = True
 
 
 def mirrored_coordinates(
@@ -64,7 +66,8 @@ def mirrored_coordinates(
     if not advice:
         advice = other_axis(planes)
     if advice and any(value > _TORN for value in facts.values()):
-        return Told(np.zeros(known.shape, np.bool_), {**facts, "mirrors_looked_for": False}, advice)
+        facts["mirrors_looked_for"] = False
+        return Told(np.zeros(known.shape, np.bool_), facts, advice, trusted=False)
     waves = [_wave(plane, known) for plane in planes.values()]
     strong = np.where(known, strength, np.float32(0.0))
     mask = reversed_pattern(waves, strong)

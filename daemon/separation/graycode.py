@@ -170,6 +170,8 @@ class GrayCodeDecoder:
         sums, unequal = self._sums.told(float(np.median(deviation)))
         flags = bits(mirrors.mirrored, Quality.RESIDUE)
         flags |= bits(fine.disagree, Quality.DISAGREE)
+        if not mirrors.trusted:
+            flags |= np.uint16(Quality.DISAGREE)
         if moved is not None:
             flags |= moved
         return finish(

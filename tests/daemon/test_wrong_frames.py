@@ -295,6 +295,7 @@ def test_a_projector_of_gamma_2_2_is_told_or_makes_no_difference(
 def test_gray_code_in_another_order_is_told(name: str) -> None:
     finest_first = _judged(name, NONE, lambda frames: frames[::-1])
     assert _says(finest_first, "jump or run back")
+    assert np.all(finest_first.quality & np.uint16(Quality.DISAGREE) != 0)
     inverse_first = _judged(name, NONE, lambda f: [f[n ^ 1] for n in range(len(f))])
     assert _says(inverse_first, "jump or run back")
 
