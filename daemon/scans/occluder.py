@@ -307,11 +307,11 @@ class OccluderMethod(Method[O]):
             return reached
         if seconds >= self.spec.time_limit_s:
             why = f"the time limit of {self.spec.time_limit_s:g} s"
-            return f"{why}: {reached}" + self._lost()
+            return f"{why}: {reached}" + self._uncovered_by_loss()
         if self._in_vain.turns(summary, seconds, self._watch.motion) < VAIN_TURNS:
             return ""
         return f"{reached}: {VAIN_TURNS} turns covered no more" + (
-            self._lost() or f"; {self.uncovered()}"
+            self._uncovered_by_loss() or f"; {self.uncovered()}"
         )
 
     def uncovered(self) -> str:
@@ -321,8 +321,9 @@ class OccluderMethod(Method[O]):
             "that are narrower than the mesh's pitch"
         )
 
-    def _lost(self) -> str:
-        """What to say of lost frames where a video ends uncovered; "": they are not why."""
+    def _uncovered_by_loss(self) -> str:
+        """Note whether a video that ends uncovered fell short for its lost frames; what to say of
+        them, "" where they are not why."""
         lost = self._rejected[LOST]
         self._short = lost > MOST_LOST * self._came
         if lost <= MANY_LOST * self._came:

@@ -27,7 +27,8 @@ from daemon.separation.references import References
 from daemon.separation.residue import NOT_SHIFTS, Mirrors, in_order, misfit_of, of_shifts
 from daemon.separation.scan_noise import ScanNoise, Told
 from daemon.separation.steadiness import HALF, compare
-from daemon.separation.uneven import Uneven, unevenness
+from daemon.separation.uneven import unevenness
+from daemon.separation.unsmooth import Unsmooth
 
 NOT_LIT_OR_UNLIT = (
     "nearly every pixel has many samples between its darkest and its brightest: the frames are no "
@@ -246,9 +247,9 @@ class Extremes:
 
     def _uneven(
         self, low: Plane, high: Plane, found: Estimated, noises: tuple[Plane, Plane]
-    ) -> Uneven:
+    ) -> Unsmooth:
         if len(low) == 1:
-            return Uneven.unknown(low[0])
+            return Unsmooth.unknown(low[0])
         # Noise is measured where light is bright. Where it is not, a count says nothing: files of
         # 8 bits are often of fewer.
         count = self._response.slope(self._response.counts(high[0]))

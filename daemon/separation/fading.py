@@ -10,17 +10,15 @@ would be if it were scattered.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.separation.estimator import Quality
-from daemon.separation.finish import bits
 from daemon.separation.handedness import Wave
 from daemon.separation.sampling import gathered
-from daemon.separation.uneven import by_light
+from daemon.separation.unsmooth import Unsmooth
 
 Plane = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -38,9 +36,6 @@ _BRIGHT = 0.8  # of the strongest contrast: where light is direct the usual fadi
 _SURE = 1.5  # times the usual spread: less says nothing
 _VARIES = 0.25  # of the usual fading: blur is not the same all over a scene
 _CORE = 3.14  # deviations of a Gaussian over the quarter of it that lies nearest to the middle
-_DEVIATIONS = 3.0  # of noise, and ...
-_PART = 0.1  # of the light: an error of more than both is flagged
-_MANY = 0.08  # of the pixels: it is said
 _TINY = np.float32(1e-3)
 _SAID = (
     "in {:.1%} of the pixels the pattern fades from the middle of its patches to their edges as no "
@@ -62,16 +57,6 @@ HALVES = Blurred(harmless=1.5, lost=0.01)  # lit and unlit
 PHASES = Blurred(harmless=0.5, lost=0.4)
 
 
-@dataclass(frozen=True, slots=True)
-class Faded:
-    """`off`: the deviation of both components for it, of a frame's shape; `flags` (H, W), uint16:
-    where that is much; `advice`: a line where it is in many pixels."""
-
-    off: Plane
-    flags: NDArray[np.uint16]
-    advice: list[str]
-
-
 def fading(
     wave: Wave,
     contrast: Plane,
@@ -81,7 +66,7 @@ def fading(
     direct_std: Plane,
     *,
     blur: Blurred,
-) -> Faded:
+) -> Unsmooth:
     """What fading leaves unsure of `direct` light, a part of the `total`, whose deviation by noise
     is `direct_std`, all of a frame's shape; the rest as in `_faded`.
 
@@ -91,13 +76,9 @@ def fading(
     part, usual = _faded(wave, contrast, noise)
     part *= np.float32(3**-0.5)
     off: Plane = (part if direct.ndim == 2 else part[..., None]) * direct
-    much = off > np.maximum(np.float32(_DEVIATIONS) * direct_std, np.float32(_PART) * total)
-    pixels = much if much.ndim == 2 else by_light(much, total)
-    many = float(np.mean(pixels))
-    advice = [_SAID.format(many)] if many > _MANY else []
+    judged = Unsmooth.judged(off, direct_std, total, _SAID)
     short = blur.lost * max(usual - blur.harmless, 0.0) ** 2
-    np.hypot(off, direct * np.float32(short), out=off)
-    return Faded(off, bits(pixels, Quality.DISAGREE), advice)
+    return replace(judged, off=np.hypot(off, direct * np.float32(short)))
 
 
 def _faded(wave: Wave, contrast: Plane, noise: Plane) -> tuple[Plane, float]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.separation.radiometry import Plane
-from daemon.separation.uneven import by_light
+from daemon.separation.unsmooth import by_light
 
 _AROUND = 9  # pixels across that a difference is averaged over
 _SURE = 2.0  # deviations of that mean: less is noise

@@ -19,7 +19,7 @@ from daemon.separation import correspondence
 from daemon.separation.coordinates import other_axis
 from daemon.separation.deviation import stated
 from daemon.separation.estimator import Components, Lighting, NotYet, Observation, Quality
-from daemon.separation.fading import PHASES, Faded, fading
+from daemon.separation.fading import PHASES, fading
 from daemon.separation.finish import SIGNIFICANT, Judgement, bits, finish
 from daemon.separation.handedness import STRONG, strength
 from daemon.separation.periods import agreed
@@ -30,6 +30,7 @@ from daemon.separation.ripple import Ripple, ripple
 from daemon.separation.scan_noise import ResidualNoise, Told
 from daemon.separation.steadiness import compare
 from daemon.separation.straddling import Split, as_neighbours, between_phases, edges
+from daemon.separation.unsmooth import Unsmooth
 from daemon.separation.wave_blur import WaveBlur
 from daemon.separation.wave_fit import WaveFit
 
@@ -234,7 +235,7 @@ class LeastSquares:
         total: Plane,
         direct_std: Plane,
         total_std: Plane,
-    ) -> tuple[Split, Faded]:
+    ) -> tuple[Split, Unsmooth]:
         """Random phases: what the edges of patches have too little of, and what scattering leaves
         unsure, see `straddling` and `fading`."""
         mean, wave = fit.grey()

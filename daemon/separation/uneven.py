@@ -8,17 +8,14 @@ by it as well, and so does the result: no step from unlit to lit is direct light
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from statistics import NormalDist
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from daemon.separation.estimator import Quality
-from daemon.separation.finish import bits
 from daemon.separation.radiometry import Plane
 from daemon.separation.sampling import thinned
+from daemon.separation.unsmooth import Unsmooth
 
 _BOX = 9  # pixels across that a spread is averaged over: noise moves their mean by 3 % ...
 _SURE = 1.1  # ... and by more than three times that hardly ever
@@ -27,9 +24,6 @@ _CALM = 0.25  # of the bright pixels have no larger spread by blur and place ...
 _USUAL = 2.2  # ... and hardly any has so many times theirs
 _BRIGHT = 0.2  # of the largest steps: where the usual spread is looked for
 _ERROR = 2.0  # of components, over the spread beyond all that: 1.6 in creases, 2.5 in milk
-_DEVIATIONS = 3.0  # of noise, and ...
-_PART = 0.1  # of the light: an error of more than both is flagged
-_MANY = 0.08  # of the pixels: it is said
 _TINY = np.float32(1e-6)
 _SAID = (
     "in {:.1%} of the pixels light is not the same under patterns of one lit fraction, and direct "
@@ -37,21 +31,6 @@ _SAID = (
     "reflected over less than a checker or patch there (finer patterns tell: --checker, --patch), "
     "or the projector is out of focus, or something moved"
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Uneven:
-    """`off`: how far components may be off for it, as a deviation, of a frame's shape; `flags`
-    (H, W), uint16: where it is much; `advice`: a line where that is many pixels."""
-
-    off: Plane
-    flags: NDArray[np.uint16]
-    advice: list[str]
-
-    @classmethod
-    def unknown(cls, plane: Plane) -> Uneven:
-        """Of a plane's shape, where one sample is kept at each end."""
-        return cls(np.zeros_like(plane), np.zeros(plane.shape[:2], dtype=np.uint16), [])
 
 
 def unevenness(
@@ -62,7 +41,7 @@ def unevenness(
     patterns: int,
     *,
     shifted: bool,
-) -> Uneven:
+) -> Unsmooth:
     """What the ranks of samples differ by beyond noise and what is usual in the scene.
 
     `low`, `high` (K, H, W[, 3]): the light of the darkest and brightest samples of so many
@@ -71,17 +50,7 @@ def unevenness(
     place of one pattern; under random patches blur moves those at edges, and not the others.
     """
     error = _error(low, high, noise, patterns, _BOX if shifted else _PATCHES)
-    much = error > np.maximum(np.float32(_DEVIATIONS) * known, np.float32(_PART) * high[0])
-    pixels = much if much.ndim == 2 else by_light(much, high[0])
-    flags = bits(pixels, Quality.DISAGREE)
-    part = float(np.mean(pixels))
-    return Uneven(error, flags, [_SAID.format(part)] if part > _MANY else [])
-
-
-def by_light(much: NDArray[np.bool_], light: Plane) -> NDArray[np.bool_]:
-    """Where colours that hold a third of the light are uneven. A fainter one may be what a
-    camera's correction of colours leaves of the others."""
-    return np.asarray((much * light).sum(axis=2) * 3 >= light.sum(axis=2))
+    return Unsmooth.judged(error, known, high[0], _SAID)
 
 
 def _error(low: Plane, high: Plane, noise: Plane, patterns: int, across: int) -> Plane:
