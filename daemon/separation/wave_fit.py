@@ -18,6 +18,7 @@ class WaveFit:
         self._sums: Plane | None = None
         self._scaled: Plane | None = None
         self._normal = np.zeros((3, 3))
+        self._solved: Plane | None = None
         self.frames = 0
 
     def add(self, light: Plane, delta: float) -> None:
@@ -31,6 +32,7 @@ class WaveFit:
             np.multiply(light, np.float32(row[index]), out=self._scaled)
             self._sums[index] += self._scaled
         self._normal += np.outer(row, row)
+        self._solved = None
         self.frames += 1
 
     @property
@@ -44,9 +46,11 @@ class WaveFit:
     def solve(self) -> tuple[Plane, Plane, Plane]:
         """M, and the factors of cos δ and sin δ: B sin φ, B cos φ."""
         assert self._sums is not None, "only a solvable fit is solved"
-        inverse = np.linalg.inv(self._normal).astype(np.float32)
-        found = np.tensordot(inverse, self._sums, axes=1)
-        return found[0], found[1], found[2]
+        if self._solved is None:
+            inverse = np.linalg.inv(self._normal).astype(np.float32)
+            self._solved = np.tensordot(inverse, self._sums, axes=1)
+            self._solved.flags.writeable = False  # it is asked for many times a result
+        return self._solved[0], self._solved[1], self._solved[2]
 
     def grey(self) -> tuple[Plane, Wave]:
         """M and the wave as a complex number (H, W), colours added."""

@@ -50,6 +50,15 @@ class OccluderScan(Scan, frozen=True, kw_only=True):
     )
     frame_rate_hz: Annotated[Positive, Meta(description="of the camera")] | None = None
     feed_mm_s: Annotated[Positive, Meta(description="speed of the stage")] | None = None
+    scene_mm: (
+        Annotated[
+            float, Meta(ge=0.0, description="from the occluder to the scene, for the penumbra")
+        ]
+        | None
+    ) = None
+    source_deg: Annotated[
+        float, Meta(ge=0.0, lt=90.0, description="angular diameter of the source; sun 0.53")
+    ] = SUN_DEG
 
 
 class Stick(OccluderScan, frozen=True, kw_only=True, tag="stick"):
@@ -70,13 +79,6 @@ class Stick(OccluderScan, frozen=True, kw_only=True, tag="stick"):
         | None
     ) = None
     width_mm: Annotated[Positive, Meta(description="of the stick, for the penumbra")] | None = None
-    scene_mm: (
-        Annotated[float, Meta(ge=0.0, description="from the stick to the scene, for the penumbra")]
-        | None
-    ) = None
-    source_deg: Annotated[
-        float, Meta(ge=0.0, lt=90.0, description="angular diameter of the source; sun 0.53")
-    ] = SUN_DEG
 
 
 class Mesh(OccluderScan, frozen=True, kw_only=True, tag="mesh"):
@@ -96,11 +98,4 @@ class Mesh(OccluderScan, frozen=True, kw_only=True, tag="mesh"):
     centre_mm: (
         Annotated[tuple[float, float], Meta(description="of the circle on the stage")] | None
     ) = None  # None: the middle of the travel
-    scene_mm: (
-        Annotated[float, Meta(ge=0.0, description="from the mesh to the scene, for the penumbra")]
-        | None
-    ) = None
-    source_deg: Annotated[
-        float, Meta(ge=0.0, lt=90.0, description="angular diameter of the source; sun 0.53")
-    ] = SUN_DEG
     estimator: Annotated[Literal["auto", "maxmin"], Meta(description=ESTIMATOR)] = "auto"
